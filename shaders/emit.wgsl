@@ -6,8 +6,8 @@
 // touched        [n]      lowered to the number of pairs written
 //
 // The formula for the tiles is the same as in `project`, but two kernels may round differently.
-// Surplus room gets the tile number after the last tile, which is never drawn. Tiles without room
-// are left out.
+// Surplus pairs get the tile number after the last tile, which is never drawn. Tiles beyond the
+// number that `project` counted are left out.
 #import view
 #import flat
 #import footprint

@@ -23,7 +23,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let pairs_until = first_pair[g] + touched[g];
         let first_slot = e;
         e++;
-        // Surplus room of emit has no gradient.
+        // Surplus pairs of emit have no gradient.
         if view.slot_first + first_slot >= pairs_until {
             continue;
         }

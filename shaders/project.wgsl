@@ -84,8 +84,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         return;
     }
     let center = view.focal * t.xy / t.z + view.centre;
-    // The ellipse on which alpha equals ALPHA_MIN, slightly enlarged so that rounding loses no
-    // pixel.
+    // Squared Mahalanobis radius of the ellipse on which alpha equals ALPHA_MIN, slightly enlarged
+    // so that rounding loses no pixel.
     let reach2 = 2.002 * log(opacity / ALPHA_MIN) + 1e-4;
     let half_height = sqrt(reach2 * cyy);
     let finite = det > 0.0 && det < 1e30 && abs(center.x) < 1e9 && abs(center.y) < 1e9 && half_height < 1e9 && cxx < 1e15;

@@ -41,7 +41,7 @@ fn put3(channel: u32, i: u32, value: vec3<f32>) {
     put(channel + 2u, i, value.z);
 }
 
-// Section 6: computes the gradients of the SH coefficients from that of the colour. Returns the
+// Section 5.6: computes the gradients of the SH coefficients from that of the colour. Returns the
 // gradient of the mean, on which the viewing direction depends.
 fn color_backward(i: u32, mean: vec3<f32>, splat_color: vec3<f32>, gradient: vec3<f32>) -> vec3<f32> {
     // Colour is clamped at 0 from below.
@@ -95,7 +95,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         put3(FEATURE, i, vec3<f32>(0.0));
         return;
     }
-    // Sums of section 1 over all pixels:
+    // Sums of section 5.1 over all pixels:
     // (p dx, p dy, p dx^2, p dx dy) (p dy^2, p, dL/dr, dL/dg) (dL/db, dL/df).
     var sum0 = vec4<f32>(0.0);
     var sum1 = vec4<f32>(0.0);
@@ -124,7 +124,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let s1 = splats[3u * g + 1u];
     let d_mean_by_color = color_backward(i, mean, vec3<f32>(s1.zw, splats[3u * g + 2u].x), vec3<f32>(sum1.zw, sum2.x));
 
-    // Section 3: the conic Q of the natural exponent, from the splat's base-2 exponent.
+    // Section 5.3: the conic Q of the natural exponent, from the splat's base-2 exponent.
     let ln2 = 0.6931471805599453;
     let q_xx = -2.0 * ln2 * s0.z;
     let q_xy = -ln2 * s0.w;
@@ -156,7 +156,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let a_x = (jw.x * r) * s;
     let a_y = (jw.y * r) * s;
     let cov = dilated(a_x, a_y);
-    // Section 2. Where opacity is clamped at ALPHA_MAX, only a gradient that lowers it passes.
+    // Section 5.2. Where opacity is clamped at ALPHA_MAX, only a gradient that lowers it passes.
     let opacity = 1.0 / (1.0 + exp(-param(OPACITY, i)));
     let dets = determinants(a_x, a_y);
     let clamped = kept_gain(view) * opacity * compensation(dets, view) >= ALPHA_MAX;
@@ -171,7 +171,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         d_cov_xy += half * (-before.y / det - q_xy);
         d_cov_yy += half * (before.x / det - q_yy);
     }
-    // Section 4: cov = A A^T + dilation, A = (J W) M, M = R S.
+    // Section 5.4: cov = A A^T + dilation, A = (J W) M, M = R S.
     let d_a_x = 2.0 * (d_cov_xx * a_x + d_cov_xy * a_y);
     let d_a_y = 2.0 * (d_cov_xy * a_x + d_cov_yy * a_y);
     // Columns of dL/dM = (J W)^T dL/dA.
@@ -200,7 +200,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     put(ROTATION + 2u, i, d_rotation.z);
     put(ROTATION + 3u, i, d_rotation.w);
 
-    // Section 5: the mean, through the projected centre and through J.
+    // Section 5.5: the mean, through the projected centre and through J.
     let m0 = r[0] * s.x;
     let m1 = r[1] * s.y;
     let m2 = r[2] * s.z;

@@ -1,5 +1,5 @@
 //! Queries on a generated scene with exact masks: by text, picture, point and taught name, line by
-//! line and in a terminal. The evaluation against labels, too.
+//! line and in a terminal. Also tests the evaluation against labels.
 //!
 //! Needs the offline models ('fastlgs models install-offline') and a Vulkan device. Without them
 //! the tests are skipped with a message, or fail if FASTLGS_REQUIRE_GPU is set.
@@ -54,7 +54,7 @@ fn exact_masks_give_exact_answers() {
 }
 
 #[test]
-fn absent_things_are_not_found() {
+fn absent_objects_are_not_found() {
     let Some(f) = fixture() else { return };
     let output = fastlgs(&["query", text(&f.scene), "pizza", "--json", "-"]);
     assert_eq!(
@@ -68,7 +68,7 @@ fn absent_things_are_not_found() {
 }
 
 #[test]
-fn every_way_to_ask_ends_in_the_same_object() {
+fn texts_pixels_and_pictures_find_the_same_object() {
     let Some(f) = fixture() else { return };
     let file = |name: &str| f.dir.path().join("asked").join(name);
     let run_query =

@@ -1,5 +1,5 @@
-//! The benches on generated scenes: that they run, that their figures are consistent, and the bounds
-//! that are promised. All but the first take minutes: `./test.sh --all` runs them.
+//! Tests of the benches on generated scenes. They run, their figures are consistent, and the
+//! documented bounds hold. All but the first take minutes: `./test.sh --all` runs them.
 
 use fastlgs::model_choice::SegmenterKind;
 use fastlgs::{Run, preprocess, synth, train};
@@ -238,7 +238,7 @@ fn names() {
         "--labels",
         &format!("{labels},{labels}"),
     ]);
-    // What was measured on a scene holds on the left-out one, where both are the same.
+    // Both scenes are the same, so the calibration of one has the same accuracy on the other.
     assert_eq!(figures["gap"], 0.0, "{figures}");
     assert!(number(&figures, "auroc_pooled") > 0.6, "{figures}");
 }

@@ -97,7 +97,7 @@ fn the_papers_mapping_and_trained_features_work_too() {
         &["--mapping paper"],
     );
 
-    // Trains features alone. Geometry and colour of the Gaussians stay.
+    // With --freeze, only features are trained. Geometry and colour of the Gaussians stay.
     let before = ply::read(&start).expect("the start");
     args.push("--freeze");
     args[5] = "100";
@@ -376,7 +376,7 @@ fn onnx_exports_of_sam_and_clip() {
         .sum::<f64>()
         / inside.len() as f64;
     assert!(redness > 20.0, "{redness} over {} pixels", inside.len());
-    // Until these very files are calibrated, the query uses a default calibration.
+    // The two towers are not calibrated yet, so the query uses a default calibration.
     assert_eq!(red["calibrated"], false, "{red}");
     let towers = ["--clip-image", text(&image), "--clip-text", text(&words)];
     let measured = json(&[&["models", "calibrate"], &towers[..]].concat());
@@ -529,7 +529,7 @@ fn renders_every_kind_of_picture_and_any_camera() {
 }
 
 #[test]
-fn bad_input_is_named_and_nothing_is_damaged() {
+fn bad_input_is_reported_and_scenes_stay_unchanged() {
     let Some(f) = fixture() else { return };
     let dir = tempfile::tempdir().expect("a temporary folder");
     let at = |name: &str| dir.path().join(name);

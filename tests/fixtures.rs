@@ -161,7 +161,7 @@ fn a_model_of_pycolmap() {
         let turn = glam::Quat::from_xyzw(0.0, 0.1 * k as f32, 0.02 * k as f32, 1.0).normalize();
         let turned = glam::Quat::from_mat4(&camera.world_to_camera);
         assert!(turned.dot(turn).abs() > 1.0 - 1e-5, "{turned}");
-        assert!(photo.distortion != Default::default(), "the lens bends");
+        assert!(photo.distortion != Default::default(), "no distortion");
     }
     let mut points: Vec<_> = data.points.iter().map(|p| (p.position, p.color)).collect();
     points.sort_by(|a, b| a.0.x.total_cmp(&b.0.x));

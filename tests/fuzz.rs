@@ -1,9 +1,9 @@
 //! Fuzz tests of all parsers. A parser may reject a damaged file in one sentence, but must neither
 //! panic nor hang.
 //!
-//! Inputs are mutations of valid files and of earlier finds. An input with a new message joins the
-//! corpus in `target/fuzz/PARSER`, where later runs start. `FASTLGS_FUZZ_SECONDS` sets the seconds
-//! per parser: 0.5 by default, 5 in `./test.sh --all`.
+//! Inputs are mutations of valid files and of inputs in the corpus `target/fuzz/PARSER`. An input
+//! with a new message is added to the corpus for later runs. `FASTLGS_FUZZ_SECONDS` sets the
+//! seconds per parser: 0.5 by default, 5 in `./test.sh --all`.
 
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::mask_list::annotations;

@@ -79,7 +79,7 @@ fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 }
 
 #[test]
-fn albums_are_never_written() {
+fn photo_folders_are_never_written() {
     let Some((dir, photos)) = copy() else { return };
     std::fs::write(photos.join("masks/mine.txt"), "mine").expect("a file");
     let raw = dir.path().join("raw");
@@ -105,7 +105,7 @@ fn albums_are_never_written() {
 }
 
 #[test]
-fn of_two_runs_the_second_says_who_holds_the_scene() {
+fn a_second_run_on_a_locked_scene_is_refused() {
     let Some((dir, photos)) = copy() else { return };
     let scene = dir.path().join("scene");
     let args = [
@@ -185,7 +185,7 @@ fn trained_share(mask: impl Fn(u32, u32, &Path)) -> Option<Result<f64, String>> 
 }
 
 #[test]
-fn masks_mean_the_same_however_they_are_saved() {
+fn ignore_masks_of_all_encodings_have_the_same_effect() {
     let outside = |x: u32, y: u32| !(40..80).contains(&x) || !(30..90).contains(&y);
     let expected = 1.0 - 40.0 * 60.0 / (160.0 * 120.0);
     let one = |x: u32, y: u32| u8::from(outside(x, y));
@@ -285,7 +285,7 @@ fn train_with_poses(
 const CORRECT_POSES_PSNR: f64 = 24.5;
 
 #[test]
-fn poses_far_from_the_origin_keep_their_digits() {
+fn poses_far_from_the_origin_keep_their_precision() {
     let utm = DVec3::new(512_345.6, 5_403_210.9, 431.2);
     let moved = |_: usize, mut pose: DMat4| {
         pose.w_axis += utm.extend(0.0);
@@ -360,7 +360,7 @@ fn poses_far_from_the_origin_keep_their_digits() {
 }
 
 #[test]
-fn units_and_one_wrong_pose_do_not_matter() {
+fn training_tolerates_any_unit_and_one_wrong_pose() {
     for unit in [1e-5f64, 1e5] {
         let scaled = |_: usize, mut pose: DMat4| {
             pose.w_axis = (unit * pose.w_axis.truncate()).extend(1.0);
@@ -389,7 +389,7 @@ fn units_and_one_wrong_pose_do_not_matter() {
 }
 
 #[test]
-fn the_photos_tell_the_convention_of_their_poses() {
+fn the_convention_of_poses_is_detected_from_the_photos() {
     let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
     type Write<'a> = &'a dyn Fn(usize, DMat4) -> DMat4;
     let conventions: [(&str, Write<'_>); 3] = [
@@ -409,7 +409,7 @@ fn the_photos_tell_the_convention_of_their_poses() {
 }
 
 #[test]
-fn photos_that_were_cut_off_are_refused() {
+fn truncated_photos_are_refused() {
     let Some((dir, photos)) = copy() else { return };
     let path = photos.join("images/003.png");
     let mut jpeg = std::io::Cursor::new(Vec::new());
@@ -432,7 +432,7 @@ fn photos_that_were_cut_off_are_refused() {
 }
 
 #[test]
-fn what_another_editor_saved_without_objects_is_said_to_have_none() {
+fn a_scene_file_without_object_ids_is_reported() {
     let Some(room) = run::room() else { return };
     let dir = tempfile::tempdir().expect("a folder");
     let scene = dir.path().join("scene");

@@ -56,7 +56,7 @@ fn models_are_there() -> bool {
 }
 
 #[test]
-fn stages_report_and_a_cancelled_one_leaves_the_scene_as_it_was() {
+fn stages_report_progress_and_cancelling_keeps_the_scene() {
     if !models_are_there() {
         return;
     }
@@ -334,7 +334,7 @@ fn moved_cameras_stay_with_their_gaussians() {
 }
 
 #[test]
-fn errors_name_the_file_and_the_mend() {
+fn errors_name_the_file_and_the_remedy() {
     let missing = Path::new("/nowhere/photos");
     let config = preprocess::PreprocessConfig {
         photos: missing.into(),

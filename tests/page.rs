@@ -55,7 +55,7 @@ fn snapshot(browser: &Browser) -> RgbImage {
 }
 
 /// Returns the IoU of the server's mask and the highlighted pixels. Other pixels are dimmed
-/// (web/splat.wgsl, `shown`).
+/// (`web/splat.wgsl`, `inside_image`).
 fn lit_iou(plain: &RgbImage, marked: &RgbImage, mask: &RgbImage) -> f64 {
     let distance = |a: [f64; 3], b: [u8; 3]| {
         (0..3)
@@ -295,7 +295,7 @@ fn page_works(
 }
 
 #[test]
-fn a_text_lights_up_its_object_in_the_browser() {
+fn a_text_highlights_its_object_with_every_renderer() {
     if !chromium() {
         return;
     }
@@ -326,7 +326,7 @@ fn a_text_lights_up_its_object_in_the_browser() {
 }
 
 #[test]
-fn what_one_sees_is_named_measured_and_passed_on() {
+fn objects_are_named_measured_and_shared_by_link() {
     if !chromium() {
         return;
     }
@@ -514,7 +514,7 @@ fn what_one_sees_is_named_measured_and_passed_on() {
 }
 
 #[test]
-fn a_large_scene_is_seen_soon() {
+fn a_large_scene_appears_within_seconds() {
     const GAUSSIANS: usize = 100_000;
     if !chromium() {
         return;
@@ -550,7 +550,7 @@ fn a_large_scene_is_seen_soon() {
     }
 }
 
-/// A file server. It ends with this value.
+/// A file server. Dropping this value ends it.
 struct Files(Child);
 
 impl Files {
@@ -597,7 +597,7 @@ impl Drop for Files {
 }
 
 #[test]
-fn a_shared_folder_answers_without_a_program() {
+fn an_exported_page_answers_on_a_static_server() {
     if !chromium() {
         return;
     }
@@ -636,7 +636,7 @@ fn a_shared_folder_answers_without_a_program() {
     );
     assert!(other.join("letter.txt").is_file());
 
-    // Serves the page below the root, as project pages on the web are.
+    // Serves the page in a subfolder of the site, as GitHub Pages does for projects.
     let (_files, url) = Files::of(dir.path());
     let browser = Browser::open(window().0, window().1, &["--enable-unsafe-swiftshader"]);
     browser.go(&format!("{url}/my%20page/"));
@@ -695,7 +695,7 @@ fn a_shared_folder_answers_without_a_program() {
 
 #[test]
 #[ignore = "minutes; ./test.sh --all runs it"]
-fn the_fox_lights_up_in_the_browser() {
+fn the_fox_is_highlighted_in_the_browser() {
     let photos = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/fox");
     if !photos.is_dir() {
         eprintln!("SKIPPED: {} is not there", photos.display());

@@ -142,7 +142,7 @@ fn transparent_and_masked_pixels_do_not_count() {
 
 /// Lens distortion that no input file reports is estimated and removed.
 #[test]
-fn an_untold_bend_of_the_lens_is_found_and_removed() {
+fn unstated_lens_distortion_is_found_and_removed() {
     let Some(dir) = scene_dir() else { return };
     let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
     json(&[
@@ -274,7 +274,7 @@ fn an_untold_bend_of_the_lens_is_found_and_removed() {
 }
 
 #[test]
-fn preprocessing_does_again_only_what_changed() {
+fn preprocessing_recomputes_only_what_changed() {
     let Some(dir) = scene_dir() else { return };
     let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
     json(&[
@@ -355,7 +355,7 @@ fn preprocessing_does_again_only_what_changed() {
 
 /// Without the exact poses, structure from motion must recover them up to a similarity transform.
 #[test]
-fn photos_without_poses_are_placed() {
+fn photos_without_poses_get_poses() {
     let Some(dir) = scene_dir() else { return };
     let (photos, exact, scene) = (
         dir.path().join("photos"),
@@ -458,9 +458,9 @@ fn photos_without_poses_are_placed() {
 }
 
 /// Two fifths of the poses are wrong but consistent with each other, as when a room has two similar
-/// sides. They are estimated again.
+/// sides. All poses are computed again.
 #[test]
-fn poses_of_which_many_are_wrong_are_found_anew() {
+fn all_poses_are_recomputed_if_many_are_wrong() {
     let Some(dir) = scene_dir() else { return };
     let fox = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/fox");
     if !fox.is_dir() {

@@ -110,7 +110,7 @@ proptest! {
     }
 
     #[test]
-    fn compact_files_keep_what_their_bytes_can(scene in scene()) {
+    fn compact_files_stay_within_the_quantisation_error(scene in scene()) {
         let back = round_trip(|p| compact::write(p, &scene, &Precision::default()).expect("written"), |p| compact::read(p).expect("read"));
         prop_assert_eq!(&back.object_ids, &scene.object_ids);
         // Positions have three bytes over at most 100 units. Other values have two bytes over their
@@ -124,7 +124,7 @@ proptest! {
     }
 
     #[test]
-    fn spz_keeps_what_eyes_see(scene in scene()) {
+    fn spz_files_stay_within_the_quantisation_error(scene in scene()) {
         let back = round_trip(|p| spz::write(p, &scene).expect("written"), |p| spz::read(p).expect("read"));
         prop_assert_eq!(back.len(), scene.len());
         for i in 0..scene.len() {
@@ -136,7 +136,7 @@ proptest! {
     }
 
     #[test]
-    fn sog_keeps_what_eyes_see(scene in scene()) {
+    fn sog_files_stay_within_the_quantisation_error(scene in scene()) {
         let back = round_trip(|p| sog::write(p, &scene).expect("written"), |p| sog::read(p).expect("read"));
         prop_assert_eq!(back.len(), scene.len());
         // SOG reorders the Gaussians.
@@ -166,7 +166,7 @@ proptest! {
     }
 
     #[test]
-    fn measures_of_masks_are_what_they_are_called(a in mask(48), b in mask(48)) {
+    fn metrics_of_masks_have_their_invariants(a in mask(48), b in mask(48)) {
         let iou = metrics::iou(&a, &b);
         prop_assert!((0.0..=1.0).contains(&iou));
         prop_assert_eq!(iou, metrics::iou(&b, &a));
@@ -182,7 +182,7 @@ proptest! {
     }
 
     #[test]
-    fn measures_of_pictures_and_ranks(x in prop::collection::vec(0.0f32..1.0, 192), y in prop::collection::vec(0.0f32..1.0, 192), p in prop::collection::vec(0.0f64..1.0, 1..9), n in prop::collection::vec(0.0f64..1.0, 1..9)) {
+    fn metrics_of_images_and_ranks_are_symmetric(x in prop::collection::vec(0.0f32..1.0, 192), y in prop::collection::vec(0.0f32..1.0, 192), p in prop::collection::vec(0.0f64..1.0, 1..9), n in prop::collection::vec(0.0f64..1.0, 1..9)) {
         let ssim = |a: &[f32], b: &[f32]| metrics::ssim(a, b, 16, 12, &[true; 192]);
         prop_assert!((ssim(&x, &x) - 1.0).abs() < 1e-5);
         prop_assert!((ssim(&x, &y) - ssim(&y, &x)).abs() < 1e-9);
@@ -192,7 +192,7 @@ proptest! {
     }
 
     #[test]
-    fn objects_hold_their_parts_and_no_others(parents in tree(), pick in any::<u16>()) {
+    fn members_of_an_object_are_its_parts(parents in tree(), pick in any::<u16>()) {
         let grid = grid(&parents);
         let id = pick % parents.len() as u16 + 1;
         let chain: Vec<u16> = grid.chain(id).collect();
@@ -241,7 +241,7 @@ proptest! {
     }
 
     #[test]
-    fn codes_are_apart_by_the_lattice(count in 1usize..400, seed in any::<u64>()) {
+    fn codes_keep_the_spacing_of_the_lattice(count in 1usize..400, seed in any::<u64>()) {
         let codes = codes::lattice(count, seed);
         // Spacing K^(-1/3) (paper), with the side of the lattice rounded up.
         let side = (1..).find(|s: &usize| s.pow(3) >= count).expect("a side") as f32;

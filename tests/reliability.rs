@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
-/// A small preprocessed and trained scene, with the duration of its training.
+/// A small trained scene. `dir` also holds its `photos` and the `untrained` scene.
 struct Fixture {
     dir: tempfile::TempDir,
     trained: PathBuf,
@@ -66,8 +66,8 @@ fn results(scene: &Path) -> [Vec<u8>; 3] {
         .map(|f| std::fs::read(scene.join(f)).expect("a file"))
 }
 
-/// Runs the binary until it ends itself at a stop point, as if it were killed there. Returns whether
-/// it was stopped.
+/// Runs the binary until it aborts at a stop point, as if it were killed there. Returns whether it
+/// was stopped.
 fn stopped(args: &[&str], stage: &str, step: u64) -> bool {
     let output = Command::new(env!("CARGO_BIN_EXE_fastlgs"))
         .env("FASTLGS_STOP_AT", format!("{stage}:{step}"))
@@ -143,7 +143,7 @@ fn a_killed_make_continues() {
     );
 }
 
-/// The files of a scene but for the manifest, which has seconds in it.
+/// Returns the files of a scene, without the manifest, which contains durations.
 fn files_of(root: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let folders = ["photos", "cameras", "masks"].map(|folder| root.join(folder));
     let entries = folders
@@ -231,7 +231,7 @@ fn a_full_disk_leaves_earlier_results_whole() {
     copy_folder(&f.trained, &scene);
     let before = results(&scene);
     // Limits files to 64 blocks of 512 or 1024 bytes, also for root. The shell ignores the signal
-    // XFSZ that goes with the limit.
+    // XFSZ, which the kernel sends at the limit.
     let limited = |args: &[&str]| {
         let script = "trap '' XFSZ; ulimit -f 64; exec \"$0\" \"$@\"";
         Command::new("sh")
@@ -275,7 +275,7 @@ fn a_full_disk_leaves_earlier_results_whole() {
 }
 
 #[test]
-fn places_that_cannot_be_written_are_named() {
+fn unwritable_output_paths_are_reported() {
     let Some(f) = fixture() else { return };
     let scene = text(&f.trained);
     // Nobody can write there, not even root.

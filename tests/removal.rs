@@ -20,8 +20,8 @@ fn coffee(f: &Fixture) -> u16 {
     answer["objects"][0]["id"].as_u64().expect("an object") as u16
 }
 
-/// Returns the label on whose surface Gaussian `i` lies, by a vote of all photos with exact depth
-/// and masks. A photo votes if its depth agrees within 3 %. `None` without votes.
+/// Returns the label of the surface on which Gaussian `i` lies, by a vote of all photos with exact
+/// depth and masks. A photo votes if its depth agrees within 3 %. Returns `None` without votes.
 fn label_of(scene: &Gaussians, i: usize, photos: &[(Camera, Vec<f32>, LabelMap)]) -> Option<u16> {
     let mut votes = std::collections::BTreeMap::new();
     for (camera, depth, things) in photos {
@@ -47,7 +47,7 @@ fn label_of(scene: &Gaussians, i: usize, photos: &[(Camera, Vec<f32>, LabelMap)]
 
 /// 3-D segmentation from a text. (The paper passes its masks to SAGA for this.)
 #[test]
-fn the_gaussians_of_an_answer_are_the_things() {
+fn the_gaussians_of_an_answer_lie_on_the_object() {
     let Some(f) = fixture() else { return };
     let id = coffee(f);
     let folder = SceneFolder::open(&f.scene).expect("the scene");
@@ -93,7 +93,7 @@ fn the_gaussians_of_an_answer_are_the_things() {
 
 /// The ground truth is the same room, generated without the object.
 #[test]
-fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
+fn a_removed_object_is_replaced_by_its_background() {
     let Some(f) = fixture() else { return };
     let at = |name: &str| f.dir.path().join("removal").join(name);
     let (truth, removed_scene) = (at("truth"), at("tidy"));

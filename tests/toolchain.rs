@@ -14,6 +14,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
+/// Two trained scenes below `scenes`, with their photos.
 struct Library {
     dir: tempfile::TempDir,
     photos: PathBuf,
@@ -131,7 +132,7 @@ fn one_command_makes_a_scene_and_keeps_it_until_the_photos_change() {
 }
 
 #[test]
-fn a_library_names_the_scenes_that_hold_a_thing() {
+fn a_library_query_lists_the_scenes_with_the_object() {
     let Some(l) = library() else { return };
     let scenes = l.dir.path().join("library");
     copy_folder(&l.scenes, &scenes);
@@ -329,7 +330,7 @@ fn scenes_of_other_programs_get_objects() {
 }
 
 #[test]
-fn selections_and_camera_paths_go_out_and_in() {
+fn selections_and_camera_paths_are_exported_and_read() {
     let Some(l) = library() else { return };
     let room = l.scenes.join("room");
     let out = l.dir.path().join("exchange");
@@ -475,7 +476,7 @@ fn other_programs() -> Option<PathBuf> {
 }
 
 #[test]
-fn programs_of_others_read_what_is_exported() {
+fn other_programs_read_exported_files() {
     let (Some(l), Some(others)) = (library(), other_programs()) else {
         return;
     };
@@ -616,7 +617,7 @@ fn bytes(path: &Path) -> u64 {
 }
 
 #[test]
-fn shells_and_manuals() {
+fn completions_and_manual_pages_are_complete() {
     for (shell, word) in [
         ("bash", "complete"),
         ("zsh", "#compdef"),
@@ -727,7 +728,7 @@ fn examples_run() {
 
 /// Runs the workflow on two scenes. FASTLGS_SNAKEMAKE names the program.
 #[test]
-fn a_workflow_engine_spreads_scenes() {
+fn snakemake_runs_the_workflow_on_two_scenes() {
     let Some(snakemake) = std::env::var_os("FASTLGS_SNAKEMAKE") else {
         eprintln!("SKIPPED: FASTLGS_SNAKEMAKE is not set to the path of snakemake");
         return;

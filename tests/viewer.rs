@@ -261,7 +261,7 @@ fn the_interface_answers_as_the_query_command_does() {
 }
 
 #[test]
-fn only_those_may_ask_who_should() {
+fn unauthorised_requests_are_refused() {
     let Some(scene) = room() else { return };
     let host = |served: &Server, host: &str| {
         let agent: ureq::Agent = ureq::Agent::config_builder()
@@ -363,7 +363,7 @@ fn only_those_may_ask_who_should() {
 }
 
 #[test]
-fn a_growing_scene_can_be_watched() {
+fn a_training_scene_is_served() {
     let Some(scene) = room() else { return };
     let dir = tempfile::tempdir().expect("a temporary folder");
     let copy = dir.path().join("growing");

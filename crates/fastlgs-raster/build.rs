@@ -107,7 +107,8 @@ fn expand(
     out: &mut String,
 ) {
     let text = fs::read_to_string(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
-    // An 8x8 tile has 16 quads. With WIDE one invocation owns all, else sixteen share them.
+    // An 8x8 tile has 16 quads. With WIDE, one invocation owns all of them. Otherwise each of 16
+    // invocations owns one.
     let (quads, columns) = if flags.contains(&"WIDE") {
         (16, 2)
     } else {

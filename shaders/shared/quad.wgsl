@@ -6,8 +6,8 @@ fn inside(x: u32, y: u32, view: View) -> vec4<f32> {
     return select(vec4<f32>(0.0), vec4<f32>(1.0), in_row & vec4<bool>(y < view.size.y));
 }
 
-// Linear coefficients of a Gaussian's exponent (base 2, including opacity) in one row: qx dx^2 + c1
-// dx + c0.
+// Linear coefficients of a Gaussian's exponent (base 2, including opacity) in one row:
+// qx dx^2 + c1 dx + c0.
 struct Row {
     c1: f32,
     c0: f32,

@@ -39,7 +39,8 @@ fn take_plane(group: vec3<u32>) {
     plane = planes.each[plane_index];
 }
 
-// Returns one output from the middle input and the sums of the pairs beside it, from near to far.
+// Returns the blurred value from the middle input a0 and from a1 to a5, where ak is the sum of the
+// two inputs at distance k.
 fn window(a0: vec4<f32>, a1: vec4<f32>, a2: vec4<f32>, a3: vec4<f32>, a4: vec4<f32>, a5: vec4<f32>) -> vec4<f32> {
     return 0.2660117249 * a0 + 0.2130055377 * a1 + 0.1093606895 * a2 + 0.0360007721 * a3 + 0.0075987581 * a4 + 0.0010283801 * a5;
 }

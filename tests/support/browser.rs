@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 /// Limit of every wait. Even software rendering on a busy machine is faster.
 const TIMEOUT: Duration = Duration::from_secs(180);
 
-/// A browser with one page. It ends with this value.
+/// A browser with one page. Dropping this value ends it.
 pub struct Browser {
     driver: Child,
     session: String,

@@ -41,7 +41,7 @@ pub fn fastlgs(args: &[&str]) -> Output {
         .expect("the binary starts")
 }
 
-/// Returns whether the full tests run (`./test.sh --full_tests`). Otherwise slow tests are shortened.
+/// Returns whether the full tests run (`./test.sh --all`). Otherwise slow tests are shortened.
 pub fn full_tests() -> bool {
     std::env::var_os("FASTLGS_TEST_ALL").is_some()
 }

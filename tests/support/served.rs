@@ -13,7 +13,7 @@ pub fn room() -> Option<&'static Path> {
     super::run::room().map(|room| room.scene.as_path())
 }
 
-/// A running `fastlgs serve` or `train --serve`. It ends with this value.
+/// A running `fastlgs serve` or `train --serve`. Dropping this value ends it.
 pub struct Server {
     pub process: Child,
     /// URL of the server without a path.

@@ -201,8 +201,8 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     let inside = g.op("Sub", &[&reach, &distance], &[]);
     let steep = g.floats(&[1], &[1e4]);
     let logits = g.op("Mul", &[&inside, &steep], &[]);
-    // Larger masks score higher, so that borders with blended colours do not win over the areas
-    // they enclose.
+    // Larger masks score higher. Otherwise, thin masks of blended colours at borders would suppress
+    // the areas that they enclose.
     let zero = g.floats(&[1], &[0.0]);
     let positive = g.op("Greater", &[&logits, &zero], &[]);
     let positive = g.op(

@@ -153,7 +153,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_few_directions_survive_three_numbers() {
+    fn six_directions_are_reconstructed_from_three_numbers() {
         let mut rng = Rng::new(3, "test");
         let mut kinds = Array2::from_shape_fn((6, 40), |_| rng.normal());
         kinds

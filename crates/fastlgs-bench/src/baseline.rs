@@ -255,9 +255,10 @@ impl PerPixel {
         }
     }
 
-    /// Returns the fraction of a view's pixels that are classified as an object that is not there.
-    /// An object is there if it is one of the pixel's blended ids or contains one. A blend of two
-    /// codes can come near a third code, which causes such errors. `None` for fields without codes.
+    /// Returns the fraction of a view's pixels that are classified as an object that is not at the
+    /// pixel. An object is at a pixel if it is one of the pixel's blended ids or contains one. A
+    /// blend of two codes can come near a third code, which causes such errors. `None` for fields
+    /// without codes.
     fn wrong_pixel_share(
         &self,
         scene: &mut Scene,
@@ -266,7 +267,7 @@ impl PerPixel {
         picture: &Vectors,
     ) -> Result<Option<f64>> {
         let field = scene.field(camera, None)?;
-        let (Representation::Object(codes), Field::Shares(shares)) = (&self.meaning, &*field)
+        let (Representation::Object(codes), Field::IdWeights(shares)) = (&self.meaning, &*field)
         else {
             return Ok(None);
         };
@@ -309,7 +310,7 @@ impl PerPixel {
                 .into_iter()
                 .map(|p| [pack(nearest(&p.to_vec(), codes), 1.0), 0, 0, 0])
                 .collect();
-            let field = Field::Shares(IdWeights {
+            let field = Field::IdWeights(IdWeights {
                 width: w,
                 height: h,
                 pixels,
@@ -547,7 +548,7 @@ mod tests {
     use fastlgs_grid::calibration::Calibration;
 
     #[test]
-    fn the_nearest_code_decides() {
+    fn a_pixel_gets_the_object_with_the_nearest_code() {
         let codes = Vectors::from_shape_vec((2, 1), vec![0.25, 0.75]).expect("a shape");
         assert_eq!(
             (
@@ -560,7 +561,7 @@ mod tests {
     }
 
     #[test]
-    fn the_most_relevant_layer_counts() {
+    fn relevancy_is_the_maximum_over_layers() {
         let layer =
             |v: [f32; 4]| normalised(Vectors::from_shape_vec((2, 2), v.to_vec()).expect("a shape"));
         let layers = [layer([1.0, 0.0, 0.0, 2.0]), layer([0.0, 1.0, 3.0, 0.0])];

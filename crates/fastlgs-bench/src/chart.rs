@@ -31,6 +31,7 @@ pub struct Args {
     output: PathBuf,
 }
 
+/// Methods of the chart. Training iterations of the paper's codes are called steps.
 const WAYS: [Method; 20] = [
     Method {
         name: "embeddings",
@@ -250,7 +251,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_front_holds_what_nothing_beats() {
+    fn the_pareto_front_has_all_rows_that_no_row_dominates() {
         let row = |scene: &str, seconds: f64, miou: f64| json!({ "scene": scene, "seconds": seconds, "oracle_miou": miou });
         let mut rows = [
             row("a", 1.0, 0.5),

@@ -1,5 +1,5 @@
-//! Runs commands of `fastlgs` in this process, from the words that a user would type. Each figure
-//! can thus be reproduced by hand.
+//! Runs commands of `fastlgs` in this process, with the arguments that a user would type. Each
+//! figure can thus be reproduced by hand.
 
 use crate::baseline;
 use anyhow::{Context, Result, bail};

@@ -138,7 +138,7 @@ impl Album {
     pub fn write(&self, to: &Path, change: PhotoChange, seed: u64) -> Result<()> {
         let mut rng = Rng::new(seed, "disturbed photos");
         let missing = match change {
-            PhotoChange::Missing(share) => some_of(self.shots.len(), share, &mut rng, |k| {
+            PhotoChange::Missing(share) => random_subset(self.shots.len(), share, &mut rng, |k| {
                 !self.shots[k].labelled
             }),
             _ => BTreeSet::new(),
@@ -211,7 +211,7 @@ impl Album {
 }
 
 /// Returns a random `share` (0 to 1) of the indices below `count` that `is_candidate` accepts.
-fn some_of(
+fn random_subset(
     count: usize,
     share: f32,
     rng: &mut Rng,
@@ -285,7 +285,7 @@ fn changed_masks(list: &MaskList, change: MaskChange, rng: &mut Rng) -> MaskList
     let (w, h) = (list.width as usize, list.height as usize);
     let drawn = |runs: &RunLengths| {
         let mut inside = vec![false; w * h];
-        runs.places(list.width, list.height)
+        runs.pixel_indices(list.width, list.height)
             .for_each(|p| inside[p] = true);
         inside
     };
@@ -294,7 +294,7 @@ fn changed_masks(list: &MaskList, change: MaskChange, rng: &mut Rng) -> MaskList
             inside[y as usize * w + x as usize]
         })
     };
-    let some = |share: f32, rng: &mut Rng| some_of(list.masks.len(), share, rng, |_| true);
+    let some = |share: f32, rng: &mut Rng| random_subset(list.masks.len(), share, rng, |_| true);
     let mut out = list.clone();
     match change {
         MaskChange::Eroded(pixels) => out.masks.iter_mut().for_each(|mask| {
@@ -321,19 +321,19 @@ fn changed_masks(list: &MaskList, change: MaskChange, rng: &mut Rng) -> MaskList
                 let around: Vec<bool> = (0..w * h)
                     .map(|p| neighbours(p, w, h, 1).any(|q| inside[q]))
                     .collect();
-                let lies_beside = |other: &&Mask| {
-                    let both = other.runs.places(list.width, list.height);
+                let is_adjacent = |other: &&Mask| {
+                    let both = other.runs.pixel_indices(list.width, list.height);
                     let (touching, common) =
                         both.fold((false, false), |(t, c), p| (t || around[p], c || inside[p]));
                     other.level == list.masks[own].level && touching && !common
                 };
                 let beside: Vec<usize> = (0..list.masks.len())
-                    .filter(|k| lies_beside(&&out.masks[*k]))
+                    .filter(|k| is_adjacent(&&out.masks[*k]))
                     .collect();
                 if !beside.is_empty() {
                     let other = &mut out.masks[beside[rng.below(beside.len())]];
                     std::mem::take(&mut other.runs)
-                        .places(list.width, list.height)
+                        .pixel_indices(list.width, list.height)
                         .for_each(|p| inside[p] = true);
                     out.masks[own] = Mask {
                         runs: runs(&inside),
@@ -441,7 +441,7 @@ mod tests {
     }
 
     #[test]
-    fn masks_are_changed_as_their_names_say() {
+    fn changed_masks_have_the_expected_areas() {
         assert_eq!(
             areas(MaskChange::Eroded(1)),
             [4, 8],

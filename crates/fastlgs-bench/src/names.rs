@@ -61,7 +61,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
                 labels: Some(folder.into()),
                 ..eval::EvalConfig::default()
             };
-            let report = eval::eval_session(scene, &config)?;
+            let report = eval::eval_scene(scene, &config)?;
             work.advance()?;
             Ok((texts, report))
         };

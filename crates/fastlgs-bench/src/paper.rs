@@ -136,7 +136,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rows_of_one_table_are_told_apart() {
+    fn row_names_are_unique() {
         let mut names: Vec<&str> = WAYS.iter().map(|w| w.name).collect();
         names.sort_unstable();
         names.dedup();

@@ -28,6 +28,7 @@ pub trait Drawing {
         DB::ErrorType: 'static;
 }
 
+/// Result of a drawing; the error is that of the backend.
 type Drawn = Result<(), Box<dyn std::error::Error>>;
 
 /// The font of all charts.

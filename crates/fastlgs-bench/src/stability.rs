@@ -57,7 +57,7 @@ enum Change {
     Seed,
     /// Disturbed masks, mapped to the same Gaussians.
     Masks(MaskChange),
-    /// Noise on the objects' embeddings. The value is its length.
+    /// Noise on the objects' embeddings. The value is its root mean square length.
     Embeddings(f32),
     /// Other mapping options, on the same Gaussians.
     Map(&'static [&'static str]),
@@ -332,8 +332,8 @@ fn kind_bound(kind: Kind) -> f64 {
     }
 }
 
-/// Smallest accepted value of `apart` on the twins: the fraction of a label's pixels that no other
-/// label's best object claims.
+/// Smallest accepted value of `apart` on the twins: the share of a label's pixels that are not
+/// covered by the best object of another label.
 const TWINS_APART: f64 = 0.95;
 
 const COLUMNS: [&str; 14] = [
@@ -423,6 +423,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     Ok(value)
 }
 
+/// Settings that all trials share.
 struct Suite<'a> {
     args: &'a Args,
     run: &'a Run<'a>,
@@ -684,6 +685,7 @@ const HEAT: [&str; 7] = [
     "verdict",
 ];
 
+/// Returns name and cells of each row of the heat map.
 fn heat(rows: &[Value]) -> Vec<(String, Vec<Cell>)> {
     let cells = |row: &Value| {
         let changes = &row["changes"];

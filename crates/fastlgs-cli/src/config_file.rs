@@ -1,7 +1,7 @@
 //! `--config FILE`: options of a command from a TOML file, and `--print-config`, which writes one.
 //!
-//! A key is the long name of an option, with `_` or `-`; tables only group keys. An option of the
-//! command line wins over the file.
+//! A key is the long name of an option, with `_` or `-`; tables only group keys. An option on the
+//! command line overrides the file.
 
 use anyhow::{Context, Result, bail};
 use clap::parser::ValueSource;
@@ -11,8 +11,8 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
-/// Options of this module itself, which a file cannot set.
-pub const OWN: [&str; 2] = ["config", "print_config"];
+/// Options that this module handles itself. A file cannot set them.
+pub const CONFIG_OPTIONS: [&str; 2] = ["config", "print_config"];
 /// Options of a single call, which a printed file leaves out.
 const NOT_PRINTED: [&str; 5] = ["help", "version", "json", "verbose", "quiet"];
 
@@ -23,7 +23,7 @@ const NOT_PRINTED: [&str; 5] = ["help", "version", "json", "verbose", "quiet"];
 pub fn expand(arguments: Vec<OsString>, program: &Command) -> Result<Vec<OsString>> {
     let names_command =
         |word: &OsString| word.to_str().and_then(|name| program.find_subcommand(name));
-    let Some((place, command)) = arguments
+    let Some((command_index, command)) = arguments
         .iter()
         .enumerate()
         .skip(1)
@@ -41,7 +41,7 @@ pub fn expand(arguments: Vec<OsString>, program: &Command) -> Result<Vec<OsStrin
         .with_context(|| format!("{}: it is not TOML", path.display()))?;
     let mut options = Vec::new();
     collect(&table, command, &arguments, &path, &mut options)?;
-    let (before, after) = arguments.split_at(place + 1);
+    let (before, after) = arguments.split_at(command_index + 1);
     Ok([before, &options, after].concat())
 }
 
@@ -59,6 +59,8 @@ fn path_of(arguments: &[OsString]) -> Option<PathBuf> {
     joined.or_else(apart)
 }
 
+/// Adds the options of `table` and its subtables to `out`, without those that `arguments` set.
+/// `path` is named in errors.
 fn collect(
     table: &Table,
     command: &Command,
@@ -76,7 +78,7 @@ fn collect(
             arg.get_long()
                 .is_some_and(|long| long.replace('-', "_") == id)
         });
-        let Some(option) = option.filter(|_| !OWN.contains(&id.as_str())) else {
+        let Some(option) = option.filter(|_| !CONFIG_OPTIONS.contains(&id.as_str())) else {
             let name = command.get_name();
             bail!(
                 "{}: '{key}' is not an option of fastlgs {name}; 'fastlgs {name} --print-config' lists them",
@@ -84,7 +86,7 @@ fn collect(
             );
         };
         if !is_given(option, arguments) {
-            out.extend(words(option, key, value, path)?);
+            out.extend(to_arguments(option, key, value, path)?);
         }
     }
     Ok(())
@@ -113,7 +115,7 @@ fn is_given(option: &Arg, arguments: &[OsString]) -> bool {
 }
 
 /// The option as words of a command line.
-fn words(option: &Arg, key: &str, value: &Value, path: &Path) -> Result<Vec<OsString>> {
+fn to_arguments(option: &Arg, key: &str, value: &Value, path: &Path) -> Result<Vec<OsString>> {
     let long = option.get_long().unwrap_or_default();
     let takes_value = matches!(option.get_action(), ArgAction::Set | ArgAction::Append);
     let plain = |value: &Value| -> Result<String> {
@@ -152,7 +154,7 @@ pub fn print(command: &Command, matches: &ArgMatches) -> String {
         let (Some(long), id) = (option.get_long(), option.get_id().as_str()) else {
             continue;
         };
-        if OWN.contains(&id) || NOT_PRINTED.contains(&id) {
+        if CONFIG_OPTIONS.contains(&id) || NOT_PRINTED.contains(&id) {
             continue;
         }
         if let Some(help) = option.get_help() {
@@ -226,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_gives_options_and_the_command_line_wins() {
+    fn the_command_line_overrides_the_file() {
         let text = "iterations = 12\nantialias = true\nfreeze = false\n[mapping_options]\ncues = [\"color\", \"keypoints\"]\n";
         let words = expanded(text, &["-v", "train", "SCENE"]).unwrap();
         let set = ["--iterations=12", "--antialias", "--cues=color,keypoints"];

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 /// Shortest time between two progress lines of a stage. A line also needs another tenth of the
 /// stage to be done.
-const LINE_EVERY: Duration = Duration::from_secs(15);
+const MIN_LINE_INTERVAL: Duration = Duration::from_secs(15);
 
 /// Prints progress to stderr.
 pub struct Console {
@@ -73,7 +73,8 @@ impl Console {
         );
     }
 
-    /// Shows that `done` of `total` steps are done. `details` is additional text.
+    /// Shows that `done` of `total` steps are done. `facts` is additional text for the end of the
+    /// line.
     fn advance(&self, name: &'static str, done: u64, total: u64, facts: &str) {
         let mut stages = self.stages();
         let Some(stage) = stages.get_mut(name) else {
@@ -89,7 +90,7 @@ impl Console {
                 }
             }
             Medium::Lines => {
-                if stage.last_line.0.elapsed() >= LINE_EVERY
+                if stage.last_line.0.elapsed() >= MIN_LINE_INTERVAL
                     && is_tenth_more(stage.last_line.1, done, total)
                 {
                     stage.last_line = (Instant::now(), done);
@@ -196,7 +197,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_says_where_a_stage_stands() {
+    fn a_line_reports_steps_rate_and_remaining_time() {
         let training = line("train", 400, 2_000, "loss 0.0410", Duration::from_secs(20));
         assert_eq!(
             training,
@@ -214,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_come_with_every_tenth() {
+    fn a_line_needs_another_tenth_of_the_stage() {
         assert!(
             !is_tenth_more(100, 299, 2_000)
                 && is_tenth_more(100, 300, 2_000)

@@ -101,7 +101,6 @@ Run again, it keeps a finished scene and continues an interrupted run. It rebuil
 }
 
 /// Runs the command line with the arguments of this process.
-/// Runs the command line of this process.
 pub fn main() -> ExitCode {
     let arguments = std::env::args_os().collect();
     let mut program = program::command();

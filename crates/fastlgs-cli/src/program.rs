@@ -5,7 +5,7 @@ use clap::{Arg, Command, CommandFactory};
 
 /// Options that the help of a command shows, besides the global ones. All others work as well; they
 /// are in `--config` files and in `docs/reference/commands.md`.
-const SHOWN: [(&str, &[&str]); 5] = [
+const VISIBLE_OPTIONS: [(&str, &[&str]); 5] = [
     (
         "make",
         &[
@@ -75,9 +75,10 @@ pub fn command() -> Command {
         .get_subcommands()
         .map(|command| command.get_name().to_owned())
         .collect();
-    // Changing a command moves it to the end of the list, so that all are changed in order.
+    // `mut_subcommand` moves a command to the end of the list. All commands are changed, so that
+    // their order stays.
     for name in names {
-        let shown = SHOWN
+        let shown = VISIBLE_OPTIONS
             .iter()
             .find(|(command, _)| **command == name)
             .map(|(_, ids)| ids);
@@ -116,7 +117,7 @@ mod tests {
                 command.get_name()
             );
         }
-        for (name, shown) in SHOWN {
+        for (name, shown) in VISIBLE_OPTIONS {
             let command = program.find_subcommand(name).expect("a command");
             for id in shown {
                 assert!(

@@ -40,7 +40,7 @@ fn reference() -> String {
 }
 
 fn is_hidden_global(arg: &Arg) -> bool {
-    arg.get_id() == "seed" || config_file::OWN.contains(&arg.get_id().as_str())
+    arg.get_id() == "seed" || config_file::CONFIG_OPTIONS.contains(&arg.get_id().as_str())
 }
 
 fn section(out: &mut String, command: &Command, name: &str) {

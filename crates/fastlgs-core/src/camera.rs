@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_behind_or_beside_is_not_seen() {
+    fn points_behind_or_outside_the_image_have_no_pixel() {
         let camera = Camera::look_at("a", -4.0 * Vec3::Z, Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
         let at = |x: f32, y: f32, depth: f32| {
             camera
@@ -317,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_poses_are_named() {
+    fn check_names_the_view_with_a_bad_pose() {
         let mut camera = Camera::look_at("view7", Vec3::ONE, Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
         camera.world_to_camera.x_axis.x = f32::NAN;
         assert!(camera.check().unwrap_err().contains("view7"));

@@ -71,7 +71,7 @@ pub fn write(path: &Path, cameras: &[Camera], frame: &WorldFrame) -> Result<()> 
             .to_cols_array()
             .to_vec(),
     };
-    let frame = |camera: &Camera| Frame {
+    let path_frame = |camera: &Camera| Frame {
         camera_to_world: pose(camera),
         fov: (2.0 * (camera.height as f32 / 2.0 / camera.fy).atan()).to_degrees(),
         aspect: Some(camera.width as f32 / camera.height as f32),
@@ -83,7 +83,7 @@ pub fn write(path: &Path, cameras: &[Camera], frame: &WorldFrame) -> Result<()> 
         render_width: first.width,
         fps: Some(FPS),
         seconds: Some(cameras.len() as f32 / FPS),
-        camera_path: cameras.iter().map(frame).collect(),
+        camera_path: cameras.iter().map(path_frame).collect(),
     };
     fs::write_json(path, &own)
 }
@@ -155,7 +155,7 @@ mod tests {
     use glam::Vec3;
 
     #[test]
-    fn cameras_come_back_and_axes_are_nerfstudios() {
+    fn cameras_round_trip_with_the_axes_of_nerfstudio() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("cameras.json");
         let camera = |k: f32| {

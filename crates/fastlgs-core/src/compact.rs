@@ -101,7 +101,8 @@ impl Precision {
     }
 }
 
-/// Fixed-point encoding of numbers between `low` and `high`.
+/// Fixed-point encoding of numbers between `low` and `high`. A value is a whole number of steps: 0
+/// for `low`, 2^(8 `bytes`) - 1 for `high`.
 struct FixedPoint {
     low: f32,
     high: f32,
@@ -118,14 +119,14 @@ impl FixedPoint {
         }
     }
 
-    fn last(&self) -> f64 {
+    fn max_step(&self) -> f64 {
         f64::from((1u32 << (8 * self.bytes)) - 1)
     }
 
     fn steps(&self, value: f32) -> u32 {
         let span = f64::from(self.high) - f64::from(self.low);
         if span > 0.0 {
-            ((f64::from(value) - f64::from(self.low)) / span * self.last()).round() as u32
+            ((f64::from(value) - f64::from(self.low)) / span * self.max_step()).round() as u32
         } else {
             0
         }
@@ -133,7 +134,7 @@ impl FixedPoint {
 
     fn value(&self, steps: u32) -> f32 {
         let span = f64::from(self.high) - f64::from(self.low);
-        (f64::from(self.low) + f64::from(steps) / self.last() * span) as f32
+        (f64::from(self.low) + f64::from(steps) / self.max_step() * span) as f32
     }
 }
 
@@ -162,8 +163,12 @@ pub fn write(path: &Path, scene: &Gaussians, precision: &Precision) -> Result<()
                     .into_iter()
                     .flat_map(f32::to_le_bytes),
             );
-            for place in (0..bytes).rev() {
-                planes.extend(plane.iter().map(|v| (fixed.steps(*v) >> (8 * place)) as u8));
+            for byte_index in (0..bytes).rev() {
+                planes.extend(
+                    plane
+                        .iter()
+                        .map(|v| (fixed.steps(*v) >> (8 * byte_index)) as u8),
+                );
             }
         }
         tensors.push((
@@ -326,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn precision_follows_what_quality_notices() {
+    fn choose_uses_the_fewest_bytes_that_keep_the_quality() {
         let scene = sample();
         // Quality depends only on the means, to an accuracy of 0.001.
         let quality = |g: &Gaussians| {

@@ -187,6 +187,7 @@ pub fn parse(path: &Path, lines: &[String], body: &[u8]) -> Result<Gaussians> {
     Ok(scene)
 }
 
+/// A Gaussian with dequantised values. Colour and opacity are 0 to 1; the rotation is (w, x, y, z).
 struct UnpackedGaussian {
     mean: Vec3,
     log_scale: Vec3,
@@ -195,6 +196,7 @@ struct UnpackedGaussian {
     opacity: f32,
 }
 
+/// Unpacks Gaussian `i`; `None` if its chunk or a packed property is missing.
 fn gaussian(chunks: &Table<'_>, vertices: &Table<'_>, i: usize) -> Option<UnpackedGaussian> {
     let chunk = i / CHUNK;
     let dequantise = |names: [&str; 3], bits: [f32; 3]| -> Option<Vec3> {

@@ -59,7 +59,7 @@ mod tests {
     use crate::rng::Rng;
 
     #[test]
-    fn neighbours_come_to_lie_together() {
+    fn neighbours_in_space_are_neighbours_in_the_order() {
         let mut rng = Rng::new(5, "curve");
         let mut points: Vec<Vec3> = (0..4096)
             .map(|_| Vec3::new(rng.normal(), rng.normal(), rng.normal()))

@@ -231,7 +231,7 @@ mod tests {
 
     /// A plain rename onto `/dev/null` by root would replace the device with a file.
     #[test]
-    fn devices_and_links_stay_what_they_are() {
+    fn write_atomic_keeps_pipes_and_symbolic_links() {
         use std::os::unix::fs::FileTypeExt;
         let folder = tempfile::tempdir().expect("a folder");
         let pipe = folder.path().join("pipe");
@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn what_two_change_at_once_is_changed_one_after_the_other() {
+    fn lock_serialises_concurrent_changes() {
         let dir = tempfile::tempdir().expect("a folder");
         let path = dir.path().join("count");
         let count = || {

@@ -238,7 +238,7 @@ impl Gaussians {
             .iter_mut()
             .filter(|logit| logit.is_infinite())
         {
-            *logit = logit.signum() * OPAQUE_LOGIT;
+            *logit = logit.signum() * FINITE_LOGIT;
         }
         const NAMES: [&str; BASE_CHANNELS] = [
             "x",
@@ -344,12 +344,12 @@ impl Gaussians {
     }
 }
 
-/// Signs of the SH coefficients above degree 0 after y and z are negated.
+/// Factors of the SH coefficients of degrees 1 to 3, in order, when y and z are negated.
 pub(crate) const SH_SIGNS: [f32; 15] = [
     -1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0,
 ];
-/// Logit that replaces an infinite one: an opacity of 0.999, or 0.001 with a negative sign.
-const OPAQUE_LOGIT: f32 = 7.0;
+/// Size of the logit that replaces an infinite one: an opacity of 0.999 or 0.001.
+const FINITE_LOGIT: f32 = 7.0;
 /// Distance from the median mean beyond which a Gaussian is an outlier, in multiples of the median
 /// distance.
 const OUTLIER_DISTANCE: f32 = 1000.0;
@@ -369,7 +369,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_gaussian_far_outside_does_not_set_the_range() {
+    fn far_outliers_are_removed_and_a_sky_is_kept() {
         let mut scene = Gaussians::default();
         (0..50).for_each(|k| {
             scene.push_sphere(
@@ -388,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn two_flips_are_none() {
+    fn flipping_twice_restores_the_scene() {
         let mut scene = Gaussians {
             sh_degree: 2,
             ..Gaussians::default()

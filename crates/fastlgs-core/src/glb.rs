@@ -13,6 +13,8 @@ use serde_json::{Value, json};
 use std::io::Write;
 use std::path::Path;
 
+// Numbers of the glTF 2.0 specification: file header, chunk types, component type, primitive mode
+// and buffer target.
 const MAGIC: u32 = 0x4654_6c67;
 const VERSION: u32 = 2;
 const JSON_CHUNK: u32 = 0x4e4f_534a;
@@ -31,7 +33,7 @@ fn attributes(scene: &Gaussians) -> Vec<Attribute> {
             .flat_map(|v| v.to_array())
             .collect::<Vec<f32>>()
     };
-    let extension_values = |name: &str| format!("KHR_gaussian_splatting:{name}");
+    let extension_name = |name: &str| format!("KHR_gaussian_splatting:{name}");
     let opacity: Vec<f32> = scene.opacity_logits.iter().map(|o| sigmoid(*o)).collect();
     let color = |(c, o): (&Vec3, &f32)| {
         (0.5 + SH_C0 * *c)
@@ -47,14 +49,14 @@ fn attributes(scene: &Gaussians) -> Vec<Attribute> {
             scene.sh_dc.iter().zip(&opacity).flat_map(color).collect(),
         ),
         (
-            extension_values("ROTATION"),
+            extension_name("ROTATION"),
             "VEC4",
             (0..scene.len())
                 .flat_map(|i| scene.rotation(i).to_array())
                 .collect(),
         ),
         (
-            extension_values("SCALE"),
+            extension_name("SCALE"),
             "VEC3",
             scene
                 .log_scales
@@ -62,9 +64,9 @@ fn attributes(scene: &Gaussians) -> Vec<Attribute> {
                 .flat_map(|s| s.exp().to_array())
                 .collect(),
         ),
-        (extension_values("OPACITY"), "SCALAR", opacity),
+        (extension_name("OPACITY"), "SCALAR", opacity),
         (
-            extension_values("SH_DEGREE_0_COEF_0"),
+            extension_name("SH_DEGREE_0_COEF_0"),
             "VEC3",
             flat(&scene.sh_dc),
         ),
@@ -76,7 +78,7 @@ fn attributes(scene: &Gaussians) -> Vec<Attribute> {
                 .flat_map(|i| scene.rest(i)[k].to_array())
                 .collect();
             out.push((
-                extension_values(&format!("SH_DEGREE_{degree}_COEF_{}", k - before)),
+                extension_name(&format!("SH_DEGREE_{degree}_COEF_{}", k - before)),
                 "VEC3",
                 values,
             ));
@@ -284,7 +286,8 @@ pub fn read(path: &Path) -> Result<Gaussians> {
         }
         Ok(Some(out))
     };
-    let own = |name: &str, width: usize| values(&format!("KHR_gaussian_splatting:{name}"), width);
+    let extension_attribute =
+        |name: &str, width: usize| values(&format!("KHR_gaussian_splatting:{name}"), width);
     let required = |found: Option<Vec<f32>>, name: &str| {
         found.ok_or_else(|| {
             bad(format!(
@@ -304,27 +307,27 @@ pub fn read(path: &Path) -> Result<Gaussians> {
     for degree in 1..=MAX_SH_DEGREE {
         let count = rest_len(degree) - rest_len(degree - 1);
         let found = (0..count)
-            .map(|k| own(&format!("SH_DEGREE_{degree}_COEF_{k}"), 3))
+            .map(|k| extension_attribute(&format!("SH_DEGREE_{degree}_COEF_{k}"), 3))
             .collect::<Result<Option<Vec<_>>>>()?;
         let Some(found) = found else { break };
         coefficients.extend(found.iter().map(|values| vec3(values)));
         sh_degree = degree;
     }
     let scene = Gaussians {
-        log_scales: vec3(&required(own("SCALE", 3)?, "SCALE")?)
+        log_scales: vec3(&required(extension_attribute("SCALE", 3)?, "SCALE")?)
             .into_iter()
             .map(|s| s.map(f32::ln))
             .collect(),
-        rotations: required(own("ROTATION", 4)?, "ROTATION")?
+        rotations: required(extension_attribute("ROTATION", 4)?, "ROTATION")?
             .chunks_exact(4)
             .map(|q| [q[3], q[0], q[1], q[2]])
             .collect(),
-        opacity_logits: required(own("OPACITY", 1)?, "OPACITY")?
+        opacity_logits: required(extension_attribute("OPACITY", 1)?, "OPACITY")?
             .into_iter()
             .map(|o| logit(o.clamp(0.001, 0.999)))
             .collect(),
         sh_dc: vec3(&required(
-            own("SH_DEGREE_0_COEF_0", 3)?,
+            extension_attribute("SH_DEGREE_0_COEF_0", 3)?,
             "SH_DEGREE_0_COEF_0",
         )?),
         sh_degree,
@@ -362,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn attributes_are_where_the_document_says() {
+    fn written_files_follow_the_specification_and_round_trip() {
         let mut scene = Gaussians::default();
         scene.push_sphere(Vec3::new(1.0, 2.0, 3.0), 0.25, 0.75, [1.0, 0.5, 0.0]);
         scene.push_sphere(Vec3::new(-1.0, 0.0, 5.0), 0.5, 0.5, [0.2; 3]);

@@ -1,4 +1,4 @@
-//! Id weights: which objects the pixels of a rendered view show, and with how much blending weight.
+//! Id weights: the blending weight of each object id at each pixel of a rendered view.
 
 use std::borrow::Cow;
 use std::cmp::Reverse;
@@ -25,8 +25,8 @@ pub fn pack(id: u16, weight: f32) -> u32 {
 }
 
 /// Unpacks the id and the weight (0 to 65,535) of [`pack`].
-pub fn unpack(share: u32) -> (u16, u32) {
-    ((share >> 16) as u16, share & 0xffff)
+pub fn unpack(packed: u32) -> (u16, u32) {
+    ((packed >> 16) as u16, packed & 0xffff)
 }
 
 impl IdWeights {
@@ -80,7 +80,8 @@ impl IdWeights {
     }
 }
 
-/// Returns whether `own` is more than half of a pixel's weight and at least its transmittance.
+/// Returns whether `own` is more than half of a pixel's total weight, and at least the remaining
+/// transmittance (1 minus the total). All weights are 0 to 65,535.
 fn is_majority(own: u32, pixel: &[u32; IDS_PER_PIXEL]) -> bool {
     let all: u32 = pixel.iter().map(|s| unpack(*s).1).sum();
     2 * own > all && own + all.min(65_535) >= 65_535
@@ -91,7 +92,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sums_decide() {
+    fn mask_sums_the_weights_of_member_ids() {
         let shares = |list: &[(u16, f32)]| -> [u32; IDS_PER_PIXEL] {
             std::array::from_fn(|k| list.get(k).map_or(0, |s| pack(s.0, s.1)))
         };
@@ -114,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn sets_that_overlap_are_found_where_they_have_most_of_the_weight() {
+    fn majority_sets_agree_with_mask() {
         let shares = |list: &[(u16, f32)]| -> [u32; IDS_PER_PIXEL] {
             std::array::from_fn(|k| list.get(k).map_or(0, |s| pack(s.0, s.1)))
         };

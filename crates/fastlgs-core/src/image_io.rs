@@ -21,12 +21,12 @@ fn decode(path: &Path) -> Result<DynamicImage> {
 }
 
 fn decode_bytes(path: &Path, data: &[u8]) -> Result<DynamicImage> {
-    let (mut picture, way_up) = decode_stored(path, data)?;
-    picture.apply_orientation(way_up);
+    let (mut picture, orientation) = decode_stored(path, data)?;
+    picture.apply_orientation(orientation);
     Ok(picture)
 }
 
-/// Decodes the pixels as stored and the EXIF orientation that makes them upright.
+/// Decodes the pixels as stored. Also returns the EXIF orientation that turns them upright.
 fn decode_stored(path: &Path, data: &[u8]) -> Result<(DynamicImage, Orientation)> {
     let reader = ImageReader::new(Cursor::new(data))
         .with_guessed_format()
@@ -44,20 +44,23 @@ fn decode_stored(path: &Path, data: &[u8]) -> Result<(DynamicImage, Orientation)
         ));
     }
     let mut decoder = reader.into_decoder().map_err(failed)?;
-    let rule = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    Ok((DynamicImage::from_decoder(decoder).map_err(failed)?, rule))
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    Ok((
+        DynamicImage::from_decoder(decoder).map_err(failed)?,
+        orientation,
+    ))
 }
 
 /// Returns whether JPEG data have an end marker. Decoders fill missing data with grey instead of
 /// failing.
 ///
-/// A marker is 0xff and a code. A segment with a stated length follows it. The scan data after its
-/// segment have no length and end at the next marker.
+/// A marker is the byte 0xff and a code. Most markers start a segment, which begins with its
+/// length. The compressed data after a scan segment have no length; they end at the next marker.
 fn is_whole_jpeg(data: &[u8]) -> bool {
     const END: u8 = 0xd9;
     const SCAN: u8 = 0xda;
-    // Restart markers, the start of the image and one private marker have no segment.
-    let stands_alone = |code: u8| matches!(code, 0x01 | 0xd0..=0xd8);
+    // Restart markers (RST), start of image (SOI) and TEM have no segment.
+    let has_no_segment = |code: u8| matches!(code, 0x01 | 0xd0..=0xd8);
     let mut at = 0;
     loop {
         // In scan data, 0xff00 is a byte of data and restart markers do not end them. 0xff may be
@@ -70,7 +73,7 @@ fn is_whole_jpeg(data: &[u8]) -> bool {
         if code == END {
             return true;
         }
-        if stands_alone(code) {
+        if has_no_segment(code) {
             continue;
         }
         let Some([high, low]) = data
@@ -110,11 +113,11 @@ pub enum OrientationRule {
 ///
 /// # Errors
 /// As [`load_rgb`].
-pub fn load_photo(path: &Path, way_up: OrientationRule) -> Result<Photo> {
+pub fn load_photo(path: &Path, rule: OrientationRule) -> Result<Photo> {
     let (mut decoded, orientation) = decode_stored(path, &fs::read(path)?)?;
     let is_tall = |(width, height): (u32, u32)| height > width;
     let sides = (decoded.width(), decoded.height());
-    let turns = match way_up {
+    let turns = match rule {
         OrientationRule::Upright => true,
         OrientationRule::AsPosed(width, height) => {
             use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
@@ -316,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn photos_stand_upright_unless_their_poses_count_stored_pixels() {
+    fn orientation_is_applied_unless_poses_refer_to_stored_pixels() {
         let (_dir, path) = turned(64, 32, 6);
         assert_eq!(load_rgb(&path).unwrap().dimensions(), (32, 64));
         let upright = load_photo(&path, OrientationRule::Upright).unwrap().pixels;

@@ -69,7 +69,7 @@ impl LabelMap {
     }
 
     /// Renumbers the labels 1, 2, ... without gaps, in ascending order. Also returns the old label
-    /// of each new one, starting with 0 for 0.
+    /// of each new label, indexed by the new one; entry 0 is 0.
     pub fn dense(&self) -> (Self, Vec<u16>) {
         let mut number = vec![0u16; usize::from(self.max()) + 1];
         self.labels.iter().for_each(|l| number[usize::from(*l)] = 1);
@@ -104,12 +104,13 @@ impl LabelMap {
             "both maps must have the same size"
         );
         let ((own, names), (theirs, their_names)) = (self.dense(), other.dense());
-        let place = |(a, b): (&u16, &u16)| usize::from(*a) * their_names.len() + usize::from(*b);
+        let pair_index =
+            |(a, b): (&u16, &u16)| usize::from(*a) * their_names.len() + usize::from(*b);
         let mut number = vec![None; names.len() * their_names.len()];
         own.labels
             .iter()
             .zip(&theirs.labels)
-            .for_each(|pair| number[place(pair)] = Some(0));
+            .for_each(|pair| number[pair_index(pair)] = Some(0));
         let mut pairs = Vec::new();
         for (place, number) in number.iter_mut().enumerate().filter(|n| n.1.is_some()) {
             *number = Some(pairs.len() as u16);
@@ -122,7 +123,7 @@ impl LabelMap {
             .labels
             .iter()
             .zip(&theirs.labels)
-            .map(|pair| number[place(pair)].unwrap_or(0))
+            .map(|pair| number[pair_index(pair)].unwrap_or(0))
             .collect();
         (Self { labels, ..*self }, pairs)
     }
@@ -286,7 +287,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn void_is_no_label_where_it_stands_apart() {
+    fn void_value_is_removed_unless_it_follows_the_labels() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.png");
         let read = |labels: &[u16], eight: bool| {
@@ -343,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn a_palette_gives_places_and_not_colours() {
+    fn palette_png_is_read_as_indices() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("tracked.png");
         for (depth, packed) in [

@@ -28,7 +28,7 @@ impl MaskImage {
         let picture = image_io::load_any(path)?;
         let mut values = values(&picture);
         if is_flat(&values) {
-            // The palette has a single colour: use the palette indices instead.
+            // All colours of a palette may be equal. Its indices then define the mask.
             if let Some(map) = LabelMap::load(path)
                 .ok()
                 .filter(|map| map.labels.len() == values.len())
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn palettes_are_read_by_colour_and_else_by_place() {
+    fn palettes_are_read_by_colour_or_by_index() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.png");
         for (palette, name) in [

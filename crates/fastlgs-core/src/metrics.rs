@@ -184,7 +184,8 @@ pub fn peak_in_box(relevancy: &[f32], width: u32, height: u32, boxes: &[[f64; 4]
         let k = k.rem_euclid(period);
         k.min(period - k) as usize
     };
-    // When the window moves by one, one value enters its sum and one leaves.
+    // Running sums: when the window moves by one pixel, one value enters and one leaves. The sums
+    // start with the window around pixel -1.
     let moved = |k: usize, n: usize| (mirrored(k as isize + 14, n), mirrored(k as isize - 15, n));
     let mut rows = vec![0.0f64; w * h];
     for (row, values) in rows.chunks_exact_mut(w).zip(relevancy.chunks_exact(w)) {

@@ -76,7 +76,7 @@ mod tests {
     use npyz::WriterBuilder;
 
     #[test]
-    fn numbers_of_several_kinds_are_read_and_damage_is_named() {
+    fn number_types_are_read_and_errors_name_the_file() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.npy");
         let mut bytes = Vec::new();

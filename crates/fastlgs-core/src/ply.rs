@@ -162,8 +162,8 @@ struct Header {
 /// Maximum length of a header in bytes.
 const MAX_HEADER_BYTES: usize = 1 << 16;
 
-/// Returns the lines of a header and the offset of the body. Comments may have any encoding and
-/// contain `end_header`.
+/// Returns the lines of a header and the byte offset of the body; `None` if the header is
+/// incomplete or not that of a PLY. Comments may have any encoding and contain `end_header`.
 fn header_lines(data: &[u8]) -> Option<(Vec<String>, usize)> {
     let (mut lines, mut at) = (Vec::<String>::new(), 0);
     let limit = data.len().min(MAX_HEADER_BYTES);
@@ -236,7 +236,7 @@ fn columns(path: &Path, data: &[u8], header: &Header) -> Result<Vec<Vec<f64>>> {
         Error::format(
             path,
             format!(
-                "truncated: it announces {} Gaussians but ends within number {}; copy it again",
+                "truncated: it announces {} Gaussians but ends within Gaussian {}; copy it again",
                 header.count,
                 i + 1
             ),
@@ -481,7 +481,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_drawn_is_dropped_and_counted() {
+    fn invalid_gaussians_are_dropped_with_a_warning() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("scene.ply");
         let mut damaged = sample();

@@ -106,7 +106,7 @@ pub struct SceneFolder {
 }
 
 impl SceneFolder {
-    /// Names a folder, which need not exist yet.
+    /// Creates the handle of a folder, which need not exist yet.
     pub fn new(root: impl Into<PathBuf>) -> Self {
         Self { root: root.into() }
     }
@@ -264,7 +264,7 @@ impl SceneFolder {
         self.root.join("alpha").join(format!("{view}.png"))
     }
 
-    /// Returns the path of a view's ignore mask. Black pixels do not count.
+    /// Returns the path of a view's ignore mask. Its black pixels are ignored.
     pub fn ignore_path(&self, view: &str) -> PathBuf {
         self.root.join("ignore").join(format!("{view}.png"))
     }
@@ -324,8 +324,9 @@ impl SceneFolder {
         LabelMap::load(&self.objects_path(view))
     }
 
-    /// Writes the initial points: `position` (rows x y z), `color` (rows r g b, 0 to 255), and
-    /// `seen` (a row point, training view for each observation).
+    /// Writes the initial points as tensors: `position` `[points][3]`, `color` `[points][3]` from 0
+    /// to 255, and `seen` `[pairs][2]`, the indices of a point and of a training view in which it
+    /// is visible.
     ///
     /// # Errors
     /// [`Error::Io`] with the path.
@@ -546,7 +547,7 @@ mod tests {
     }
 
     #[test]
-    fn points_come_back_with_who_sees_them() {
+    fn points_round_trip_with_their_views() {
         let dir = tempfile::tempdir().unwrap();
         let folder = SceneFolder::new(dir.path());
         let point = |x: f32, seen_by: &[u32]| SfmPoint {

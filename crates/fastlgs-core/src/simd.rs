@@ -4,8 +4,8 @@
 /// Defines a function that runs its body with the widest vectors of the processor:
 /// `vectorised! { fn name<const ...>(args) = body }` calls `body::<FMA, ...>(args)`.
 ///
-/// The body is an `#[inline(always)]` function without result. Its first const parameter says
-/// whether a fused multiply-add is fast.
+/// The body is an `#[inline(always)]` function that returns nothing. Its first const parameter is
+/// true if a fused multiply-add is fast.
 #[macro_export]
 macro_rules! vectorised {
     ($(#[$doc:meta])* fn $name:ident $(<$(const $p:ident: bool),+>)? ($($arg:ident: $ty:ty),* $(,)?) = $body:ident) => {

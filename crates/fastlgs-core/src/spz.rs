@@ -58,6 +58,7 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
     data.extend(MAGIC.to_le_bytes());
     data.extend(VERSION.to_le_bytes());
     data.extend((scene.len() as u32).to_le_bytes());
+    // SH degree, number of fractional bits, flags (bit 0: antialiased), reserved.
     data.extend([scene.sh_degree as u8, fraction, u8::from(false), 0]);
     for mean in &scene.means {
         for value in (*mean * flip).to_array() {
@@ -252,8 +253,8 @@ fn unpack_zstd(path: &Path, data: &[u8]) -> Result<Packed> {
 }
 
 /// Decodes a quaternion of versions 3 and 4 to (w, x, y, z). The top two bits are the index of the
-/// largest of (x, y, z, w). The others follow, last first in the lowest bits: nine bits of
-/// magnitude and a sign each.
+/// largest of (x, y, z, w). Each other component has ten bits: nine of magnitude, then a sign bit.
+/// The last component has the lowest bits.
 fn smallest_three(b: &[u8]) -> [f32; 4] {
     const SIZE: u32 = (1 << 9) - 1;
     let mut bits = u32::from_le_bytes([b[0], b[1], b[2], b[3]]);

@@ -7,7 +7,8 @@ use crate::Camera;
 use glam::Vec2;
 use image::{GrayImage, Luma, Rgb, RgbImage};
 
-/// Projection of a lens: distance from the centre of a ray at the angle theta to the axis.
+/// Projection of a lens: the distance from the image centre, in focal lengths, at which a ray
+/// appears whose angle to the optical axis is theta.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum LensProjection {
     /// Pinhole: tan(theta).
@@ -51,12 +52,16 @@ impl Distortion {
     /// Maps an ideal ray (x/z, y/z) to the distorted image plane.
     pub fn distort(&self, ray: Vec2) -> Vec2 {
         let r = ray.length();
-        let bent = match self.projection {
+        let projected_radius = match self.projection {
             LensProjection::None => r,
             LensProjection::Fisheye => r.atan(),
             LensProjection::Fov(omega) => (2.0 * r * (omega / 2.0).tan()).atan() / omega,
         };
-        let p = if r > 1e-9 { ray * (bent / r) } else { ray };
+        let p = if r > 1e-9 {
+            ray * (projected_radius / r)
+        } else {
+            ray
+        };
         let r2 = p.length_squared();
         let above = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)));
         let radial = above
@@ -167,7 +172,7 @@ mod tests {
     use glam::Vec3;
 
     #[test]
-    fn what_the_lens_did_not_image_is_told() {
+    fn coverage_mask_marks_pixels_outside_the_photo() {
         let name = "a.jpg".to_owned();
         let world_to_camera = glam::Mat4::IDENTITY;
         let camera = Camera {
@@ -205,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bent_ray_is_straightened() {
+    fn undistort_point_inverts_distort() {
         let lens = Distortion {
             k1: -0.15,
             k2: 0.03,

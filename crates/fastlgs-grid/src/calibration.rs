@@ -178,8 +178,8 @@ impl Calibration {
         measured: true,
     };
 
-    /// Example queries with a CLIP that was not measured. Copies the statistics of text embeddings
-    /// of the offline encoder between pictures.
+    /// Example queries with a CLIP that was not measured. The constants are those of the offline
+    /// encoder's text embeddings, compared between pictures.
     pub const CLIP_PICTURES: Self = Self {
         temperature: 26.0,
         anything: 0.6,
@@ -260,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn false_alarms_are_as_asked_with_clips_statistics() {
+    fn false_alarm_rate_is_the_accepted_rate_with_clip_statistics() {
         let rng = &mut Rng::new(7, "calibration");
         let anything = 0.21;
         // Calibrates on scenes of 40 objects and tests on scenes of 40 and 400. The maximum of
@@ -315,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn clips_law_is_that_of_its_published_statistics() {
+    fn clip_calibration_matches_published_statistics() {
         let rng = &mut Rng::new(9, "law");
         for objects in [50usize, 200, 800] {
             let margin = |rng: &mut Rng| {

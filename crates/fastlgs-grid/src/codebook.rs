@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_of_all_is_found() {
+    fn owner_is_the_nearest_code() {
         let mut rng = Rng::new(3, "features");
         for count in [1, 2, 9, 100, 777] {
             let grid = grid(&lattice(count, 5));
@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn the_spacing_is_that_of_the_codes_that_are_left() {
+    fn spacing_is_the_smallest_distance_between_codes() {
         let codes = lattice(27, 1);
         assert!((Codebook::of(&grid(&codes)).spacing() - SCALE / 3.0).abs() < 1e-3);
         assert!(

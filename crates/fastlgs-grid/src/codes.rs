@@ -20,8 +20,8 @@ fn side(count: usize) -> i32 {
 /// Returns codes in (0, 1)^3 for the objects 1..=count: cell centres of the smallest cubic lattice
 /// that holds them.
 ///
-/// The order is random with `seed`. Consecutive objects are often neighbours in the picture, and so
-/// do not get neighbouring codes.
+/// The order is random with `seed`. Consecutive objects are often neighbours in the picture; a
+/// random order rarely gives them neighbouring codes.
 pub fn lattice(count: usize, seed: u64) -> Vec<Vec3> {
     let side = side(count);
     let mut cells: Vec<IVec3> = (0..side.pow(DIMENSION))

@@ -9,8 +9,8 @@
 //! contributes no mask, and missing masks do no harm. An object, its parts and what it stands on
 //! are all found, each from its own masks.
 //!
-//! As in MaskClustering (arXiv 2401.07745), whole masks of all views decide, not the borders of
-//! two. There, however, each mask belongs to one object only.
+//! As in MaskClustering (arXiv 2401.07745), the agreement of masks in all views decides, not the
+//! overlap of two masks. There, however, each mask belongs to one object only.
 
 use crate::observations::{Fit, MIN_PIXELS, MaskId, Observations, Scratch};
 use rayon::prelude::*;
@@ -26,31 +26,33 @@ pub struct Proposal {
 
 /// Largest number of refinement rounds; nearly all sets converge within four.
 const ROUNDS: usize = 8;
-/// Number of seeds refined in parallel before masks of found proposals are skipped as seeds.
+/// Number of seeds that are refined in parallel. Between batches, seeds whose masks all belong to
+/// proposals are skipped.
 const BATCH: usize = 256;
 
 /// Returns the distinct proposals of all masks. At least `min_views` views show each of them.
-pub fn proposals(sightings: &Observations, min_views: usize) -> Vec<Proposal> {
+pub fn proposals(observations: &Observations, min_views: usize) -> Vec<Proposal> {
     // Tracks come first, then single masks in scattered order, so that a batch rarely contains the
     // same object twice.
-    let mut seeds: Vec<Vec<MaskId>> = sightings.tracks();
-    let mut single: Vec<MaskId> = (0..sightings.pixels.len() as MaskId)
-        .filter(|m| sightings.pixels[*m as usize] >= MIN_PIXELS)
+    let mut seeds: Vec<Vec<MaskId>> = observations.tracks();
+    let mut single: Vec<MaskId> = (0..observations.pixels.len() as MaskId)
+        .filter(|m| observations.pixels[*m as usize] >= MIN_PIXELS)
         .collect();
     single.sort_by_key(|mask| (mask.wrapping_mul(0x9e37_79b1), *mask));
     seeds.extend(single.into_iter().map(|mask| vec![mask]));
-    let mut explained = vec![false; sightings.pixels.len()];
+    let mut explained = vec![false; observations.pixels.len()];
     let mut found: Vec<Proposal> = Vec::new();
     let mut seeds = seeds.into_iter().peekable();
     while seeds.peek().is_some() {
         let fresh = |seed: &Vec<MaskId>| seed.iter().any(|mask| !explained[*mask as usize]);
         let batch: Vec<Vec<MaskId>> = seeds.by_ref().filter(fresh).take(BATCH).collect();
-        let rest =
-            |scratch: &mut Scratch, seed: &Vec<MaskId>| refine(sightings, seed, min_views, scratch);
+        let rest = |scratch: &mut Scratch, seed: &Vec<MaskId>| {
+            refine(observations, seed, min_views, scratch)
+        };
         let new: Vec<Option<Proposal>> = batch
             .par_iter()
             .with_min_len(BATCH / 16)
-            .map_init(|| sightings.scratch(), rest)
+            .map_init(|| observations.scratch(), rest)
             .collect();
         for proposal in new.into_iter().flatten() {
             proposal
@@ -73,7 +75,7 @@ pub fn proposals(sightings: &Observations, min_views: usize) -> Vec<Proposal> {
 /// Refines the Gaussians of the seed masks until their masks do not change, in at most [`ROUNDS`]
 /// rounds. Returns `None` if fewer than `min_views` views show the set.
 fn refine(
-    sightings: &Observations,
+    observations: &Observations,
     seed: &[MaskId],
     min_views: usize,
     scratch: &mut Scratch,
@@ -81,15 +83,15 @@ fn refine(
     let mut masks_in = seed.to_vec();
     let mut found = None;
     for _ in 0..ROUNDS {
-        let set = sightings.gaussians_in(masks_in.iter().copied(), scratch);
-        let masks = sightings.matching_masks(&set, scratch);
-        let rests = masks
+        let set = observations.gaussians_in(masks_in.iter().copied(), scratch);
+        let masks = observations.matching_masks(&set, scratch);
+        let unchanged = masks
             .iter()
             .map(|fit| fit.mask)
             .eq(masks_in.iter().copied());
         masks_in = masks.iter().map(|fit| fit.mask).collect();
         found = (masks.len() >= min_views).then_some(Proposal { set, masks });
-        if rests || masks_in.is_empty() {
+        if unchanged || masks_in.is_empty() {
             break;
         }
     }
@@ -138,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_and_wholes_are_found_and_the_views_that_show_them_decide() {
+    fn parts_and_wholes_are_proposed_despite_merged_and_split_views() {
         // A handle (2 Gaussians) on a cup (6) on a saucer (10). One view merges all of them,
         // another splits the cup.
         let good: &[_] = &[(0, 10, None), (0, 6, None), (0, 2, None)];
@@ -161,7 +163,7 @@ mod tests {
         );
     }
     #[test]
-    fn masks_that_hold_most_of_each_other_show_one_thing() {
+    fn masks_that_hold_most_of_each_other_form_one_proposal() {
         // Each view draws a bowl of six Gaussians at another position. The outer masks have an IoU
         // of 2/10, the middle one 4/8 with each of them.
         let drawn: [&[_]; 3] = [&[(1, 7, None)], &[(3, 9, None)], &[(5, 11, None)]];
@@ -174,7 +176,7 @@ mod tests {
         assert!(proposed(&drawn, |_, _| true).is_empty());
     }
     #[test]
-    fn a_tracker_joins_what_no_photo_shows_together() {
+    fn a_track_joins_masks_of_different_parts_of_an_object() {
         // Each of three views shows a different third of one object.
         let thirds = |track| [0, 1, 2].map(|view| [(4 * view, 4 * view + 4, track)]);
         let found = |track| {

@@ -34,7 +34,7 @@ pub fn decide(
     let mut labels: Vec<Option<u16>> = (0..pixels).into_par_iter().map(confident).collect();
     let mut undecided: Vec<usize> = (0..pixels).filter(|p| labels[*p].is_none()).collect();
     while !undecided.is_empty() {
-        let beside = |p: usize| {
+        let nearest_neighbour_label = |p: usize| {
             let feature = feature(p);
             let decided = neighbours(p, width as usize, pixels).filter_map(|q| labels[q]);
             let distance = |label: u16| codes::distance(feature, grid.code_of(label));
@@ -42,7 +42,10 @@ pub fn decide(
                 .min_by(|a, b| distance(*a).total_cmp(&distance(*b)).then(a.cmp(b)))
                 .map(|label| (p, label))
         };
-        let found: Vec<(usize, u16)> = undecided.par_iter().filter_map(|p| beside(*p)).collect();
+        let found: Vec<(usize, u16)> = undecided
+            .par_iter()
+            .filter_map(|p| nearest_neighbour_label(*p))
+            .collect();
         if found.is_empty() {
             // No pixel is confident.
             break;
@@ -79,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn blends_belong_to_what_lies_beside_them() {
+    fn blended_pixels_take_the_object_of_a_neighbour() {
         // The codes are 0.25, 0.5 and 0.75. A blend of objects 1 and 3 passes the code of object 2,
         // which is absent here.
         assert_eq!(
@@ -100,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn every_ring_follows_the_one_before() {
+    fn undecided_pixels_are_filled_ring_by_ring() {
         let mut values = vec![0.3f32; 3 * 25];
         (0..3).for_each(|channel| values[25 * channel] = 0.25);
         assert_eq!(decide(&grid(), 5, 5, &values, Some(5.0)).labels, [1; 25]);

@@ -8,9 +8,9 @@ use std::collections::{BTreeMap, BTreeSet};
 /// their voters' IoU.
 ///
 /// Each mask votes for the proposal that fits it best. The proposal with the fewest votes is
-/// removed, and its voters move to their next best, until all remaining ones have `min_votes` votes. So
-/// the best of several near duplicates collects their votes. Proposals that fit only masks of other
-/// objects are removed.
+/// removed, and its voters choose their next best. This repeats until all remaining proposals have
+/// `min_votes` votes. So the best of several near duplicates collects their votes. Proposals that
+/// fit only masks of other objects are removed.
 pub fn elected(proposals: Vec<Proposal>, min_votes: usize) -> Vec<Proposal> {
     let mut ballots: BTreeMap<MaskId, Vec<(f32, usize)>> = BTreeMap::new();
     for (place, proposal) in proposals.iter().enumerate() {
@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn votes_go_to_the_next_best() {
+    fn voters_of_removed_proposals_choose_the_next_best() {
         let proposal = |name: u32, fits: &[(MaskId, f32)]| Proposal {
             set: vec![name],
             masks: fits.iter().map(|&(mask, iou)| Fit { mask, iou }).collect(),

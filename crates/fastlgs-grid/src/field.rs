@@ -32,7 +32,7 @@ pub fn ids(shares: &IdWeights, lists: &[Vec<u16>]) -> LabelMap {
 /// The rendered object data of a view.
 pub enum Field {
     /// Id weights, for scenes with lifted object ids.
-    Shares(IdWeights),
+    IdWeights(IdWeights),
     /// Rendered codes, for scenes with trained features (paper).
     Features {
         /// Pixels along x.
@@ -53,7 +53,7 @@ impl Field {
     pub fn for_each_pixel(&self, grid: &Grid, mut visit: impl FnMut(&[u16])) {
         let lists = grid.lists();
         match self {
-            Self::Shares(shares) => shares
+            Self::IdWeights(shares) => shares
                 .majority_sets(&lists)
                 .for_each(|objects| visit(&objects)),
             Self::Features {
@@ -93,7 +93,7 @@ impl Field {
     /// Returns for each pixel the id that represents its objects; 0 for none.
     pub fn ids(&self, grid: &Grid) -> LabelMap {
         match self {
-            Self::Shares(shares) => ids(shares, &grid.lists()),
+            Self::IdWeights(shares) => ids(shares, &grid.lists()),
             Self::Features {
                 width,
                 height,
@@ -120,7 +120,7 @@ impl Field {
     /// Returns width and height in pixels.
     fn size(&self) -> (u32, u32) {
         match self {
-            Self::Shares(shares) => (shares.width, shares.height),
+            Self::IdWeights(shares) => (shares.width, shares.height),
             Self::Features { width, height, .. } => (*width, *height),
         }
     }
@@ -130,7 +130,7 @@ impl Field {
         let ids: Vec<u16> = targets.iter().map(|t| t.id).collect();
         let members = grid.members(&ids);
         match self {
-            Self::Shares(shares) => shares.mask(&members),
+            Self::IdWeights(shares) => shares.mask(&members),
             Self::Features { .. } => self
                 .owners(grid)
                 .labels
@@ -164,13 +164,13 @@ mod tests {
     use fastlgs_core::id_weights::pack;
 
     #[test]
-    fn an_object_is_shown_by_its_parts_as_well() {
+    fn mask_and_relevancy_of_an_object_include_its_parts() {
         let pixels = vec![
             [pack(1, 0.4), pack(2, 0.2), pack(3, 0.4), 0],
             [pack(2, 0.9), 0, 0, 0],
             [pack(3, 1.0), 0, 0, 0],
         ];
-        let field = Field::Shares(IdWeights {
+        let field = Field::IdWeights(IdWeights {
             width: 3,
             height: 1,
             pixels,

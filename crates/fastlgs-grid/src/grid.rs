@@ -57,7 +57,7 @@ struct Row {
     count: usize,
 }
 
-/// An object is a part of another one if more than this share of it lies there.
+/// An object is a part of another one if more than this share of its area lies in the other one.
 pub const PART: f32 = 0.7;
 
 /// Support of objects in files without this field.
@@ -416,15 +416,17 @@ impl Grid {
                 })
             })
             .collect::<Result<Vec<_>, Error>>()?;
-        // Files without the tensors `overlaps` and `id_areas` are valid.
+        // Files without the tensors `overlaps` and `shown` (the `id_areas`) are valid.
         let values = |name: &str| tensors.get(name).map_or(&[][..], |t| t.1.as_slice());
         let overlaps = values("overlaps");
         let known = |id: &f32| id.fract() == 0.0 && (0.0..=objects.len() as f32).contains(id);
-        let falls = |list: &[f32]| {
+        let is_descending_list = |list: &[f32]| {
             list.len() > 1 && list.last() == Some(&0.0) && list.is_sorted_by(|a, b| a > b)
         };
-        let are_lists =
-            overlaps.iter().all(known) && overlaps.split_inclusive(|id| *id == 0.0).all(falls);
+        let are_lists = overlaps.iter().all(known)
+            && overlaps
+                .split_inclusive(|id| *id == 0.0)
+                .all(is_descending_list);
         let lists = overlaps
             .split(|id| *id == 0.0)
             .filter(|list| !list.is_empty());

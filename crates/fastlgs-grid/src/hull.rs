@@ -34,12 +34,14 @@ pub struct Hull {
 const STRIDE: u32 = 6;
 /// Number of points tested along a ray, evenly spaced in 1/depth.
 const STEPS: u32 = 1024;
-/// Largest share of views that may contradict, because masks may be missing or too narrow.
+/// Largest share of the views in which a point of the hull may lie outside the masks. Masks may be
+/// missing or too narrow.
 const MAX_MISSED_SHARE: f32 = 0.1;
 /// Smallest ratio between the depth of the surface behind a transparent object and the object's
 /// depth. Also the tolerance of the occlusion test.
 const MIN_DEPTH_RATIO: f32 = 1.05;
-/// Search depth of a view: the 1/20 quantile of its depths, which skips outliers, times 0.5.
+/// Smallest depth at which a view searches: 0.5 times the 1/20 quantile of its depths. The quantile
+/// skips outliers.
 const SEARCH_DEPTH: (usize, f32) = (20, 0.5);
 /// Largest cell distance between neighbouring points of one hull.
 const MAX_CELL_DISTANCE: i32 = 2;
@@ -48,16 +50,16 @@ const MIN_POINTS: usize = 16;
 
 /// Returns for each pixel whether masks lie there and no object explains any of them.
 ///
-/// An object explains a mask if their IoU is at least `min_support`. `shown`: rendered id of each
-/// pixel; `lists`: the objects of each id.
+/// An object explains a mask if their IoU is at least `min_support`. `rendered_ids`: rendered id of
+/// each pixel; `lists`: the objects of each id.
 pub fn unexplained(
     atoms: &Atoms,
-    shown: &LabelMap,
+    rendered_ids: &LabelMap,
     lists: &[Vec<u16>],
     min_support: f32,
 ) -> Vec<bool> {
     let mut pixels: BTreeMap<(u16, u16), f32> = BTreeMap::new();
-    for (atom, id) in atoms.map.labels.iter().zip(&shown.labels) {
+    for (atom, id) in atoms.map.labels.iter().zip(&rendered_ids.labels) {
         *pixels.entry((*atom, *id)).or_default() += 1.0;
     }
     let (mut of_mask, mut of_object) = (
@@ -107,7 +109,7 @@ pub fn hulls(views: &[Outline], min_views: usize) -> Vec<Hull> {
         let pixels = lines(height).flat_map(move |y| lines(width).map(move |x| (x, y)));
         let inside = pixels.filter(|(x, y)| outline.inside[(y * width + x) as usize]);
         inside
-            .filter_map(|pixel| on_ray(views, view, pixel, near, min_views))
+            .filter_map(|pixel| hull_on_ray(views, view, pixel, near, min_views))
             .collect::<Vec<_>>()
     };
     group_points(
@@ -137,7 +139,7 @@ fn near(view: &Outline) -> f32 {
 
 /// Returns the middle of the hull on the ray of pixel (x, y), and the distance between rays there.
 /// Returns `None` unless the visible surface lies behind the hull.
-fn on_ray(
+fn hull_on_ray(
     views: &[Outline],
     view: usize,
     (x, y): (u32, u32),
@@ -191,8 +193,8 @@ fn is_in_hull(views: &[Outline], own: usize, place: Vec3, min_views: usize) -> b
     open + 1 >= min_views && 2 * open >= within && missed as f32 <= MAX_MISSED_SHARE * open as f32
 }
 
-/// Keeps one point in each cell of the median spacing, and groups cells that are at most [`MAX_CELL_DISTANCE`]
-/// cells apart.
+/// Keeps one point in each cell of the median spacing, and groups cells that are at most
+/// [`MAX_CELL_DISTANCE`] cells apart.
 fn group_points(found: &[(Vec3, f32)]) -> Vec<Hull> {
     let mut spacings: Vec<f32> = found.iter().map(|(_, spacing)| *spacing).collect();
     spacings.sort_by(f32::total_cmp);
@@ -280,7 +282,7 @@ mod tests {
     const HALF: Vec3 = Vec3::new(0.5, 0.5, 0.025);
 
     #[test]
-    fn a_pane_is_found_where_masks_have_it() {
+    fn hull_of_a_transparent_pane_is_found() {
         let found = hulls(&views(false, 0), 3);
         let [hull] = found.as_slice() else {
             panic!("{} hulls", found.len())
@@ -301,13 +303,13 @@ mod tests {
     }
 
     #[test]
-    fn one_view_of_twelve_may_lack_the_mask_and_three_may_not() {
+    fn a_hull_tolerates_one_missing_mask_of_twelve_but_not_three() {
         assert_eq!(hulls(&views(false, 1), 3).len(), 1);
         assert!(hulls(&views(false, 3), 3).is_empty());
     }
 
     #[test]
-    fn what_is_seen_itself_is_not_seen_through_nor_is_the_sky_a_thing() {
+    fn opaque_objects_and_sky_give_no_hull() {
         assert!(hulls(&views(true, 0), 3).is_empty());
         let sky = |mut view: Outline| {
             let pixels = view.inside.iter_mut().zip(&mut view.depth);
@@ -324,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mask_that_an_object_fits_is_explained_and_so_is_all_in_it() {
+    fn pixels_of_masks_that_an_object_explains_are_explained() {
         // Masks of 0..6, 0..2 and 8..12 on a row of 14 pixels. Object 1 covers 0..5, object 2 only
         // pixel 9.
         let mask = |from, to| {

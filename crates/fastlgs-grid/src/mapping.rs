@@ -54,7 +54,7 @@ impl Mask {
     ///
     /// sim = alpha * Bhattacharyya coefficient of C + (1 - alpha) * cosine of L. The paper's prose
     /// swaps the two names; this follows its formulas.
-    fn look(&self, alpha: f32) -> Vec<f32> {
+    fn descriptor(&self, alpha: f32) -> Vec<f32> {
         let color = self.histogram.iter().map(|share| (alpha * share).sqrt());
         color
             .chain(
@@ -92,8 +92,8 @@ fn products_body<const FMA: bool>(with: &[f32], others: &[Vec<f32>], out: &mut [
     }
 }
 
-/// A representative that is at least this similar to a mask of its object makes the mask
-/// superfluous.
+/// Similarity from which two masks of an object are treated as equal. A mask that is this similar
+/// to a representative of its object does not become one.
 ///
 /// Objects whose similarities to a mask differ by at most 1 minus this are treated as equally
 /// similar.
@@ -134,7 +134,7 @@ pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> R
     let mut representatives: Vec<usize> = Vec::new();
     let looks: Vec<Vec<f32>> = masks
         .par_iter()
-        .map(|mask| mask.look(config.alpha))
+        .map(|mask| mask.descriptor(config.alpha))
         .collect();
     for photo in masks.chunk_by(|a, b| a.view == b.view) {
         let first = mapped.object_of.len();
@@ -152,7 +152,7 @@ pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> R
         let key_points = |mask: usize, object: u16| {
             shared_with(first + mask, object, first, pairs, &mapped, config)
         };
-        for (mask, object) in most_alike_first(&similarity_to, config.theta, key_points) {
+        for (mask, object) in candidates_by_similarity(&similarity_to, config.theta, key_points) {
             if object_of[mask].is_none() && !object_of.contains(&Some(object)) {
                 object_of[mask] = Some(object);
             }
@@ -165,8 +165,6 @@ pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> R
                     mapped.count
                 }
             };
-            // A representative of the same object that is similar enough makes this mask
-            // superfluous.
             if similarity_to[k]
                 .get(&object)
                 .is_none_or(|sim| *sim < SAME_SIMILARITY)
@@ -218,8 +216,8 @@ fn similarities(
     representatives: &[usize],
     mapped: &Mapped,
 ) -> Vec<BTreeMap<u16, f32>> {
-    // Loop order for the cache: the vectors of the photo stay in it while each representative
-    // passes once.
+    // Loop order for the cache: the vectors of the photo stay in it, and each representative is
+    // read once.
     let with = |k: &usize| {
         let mut row = vec![0.0; photo.len()];
         products(&looks[*k], &looks[photo.clone()], &mut row);
@@ -241,7 +239,7 @@ fn similarities(
 ///
 /// Sorts by shared key points, then by similarity. Key points count only if the object is about as
 /// similar as the mask's most similar one.
-fn most_alike_first(
+fn candidates_by_similarity(
     alike: &[BTreeMap<u16, f32>],
     theta: f32,
     key_points: impl Fn(usize, u16) -> u32,
@@ -318,14 +316,18 @@ mod tests {
             "key points are an option"
         );
         let mut similarity = [0.0];
-        products(&masks[1].look(0.3), &[masks[3].look(0.3)], &mut similarity);
+        products(
+            &masks[1].descriptor(0.3),
+            &[masks[3].descriptor(0.3)],
+            &mut similarity,
+        );
         assert!((similarity[0] - (0.7 + 0.3 * (0.225f32.sqrt() + 0.275f32.sqrt()))).abs() < 1e-6);
     }
 
     /// Two mugs look the same. Key points match the left one of the second photo to the right one
     /// of the first. A third, less similar object shares more key points, which do not count.
     #[test]
-    fn key_points_tell_twins_apart() {
+    fn key_points_separate_objects_that_look_the_same() {
         let masks = [
             mask(0, 1, [1.0, 0.0], [1.0, 0.0]),
             mask(0, 2, [1.0, 0.0], [1.0, 0.0]),
@@ -381,7 +383,7 @@ mod tests {
     }
 
     #[test]
-    fn work_grows_with_the_photos_and_not_with_their_square() {
+    fn work_grows_linearly_with_the_number_of_photos() {
         let [few, many] = [250, 1000].map(|views| {
             let masks = walk(views);
             let mapped = paper(

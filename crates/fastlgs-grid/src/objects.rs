@@ -11,7 +11,7 @@ use std::collections::BTreeSet;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SelectionConfig {
     /// Smallest number of views that show it, each with at least
-    /// [`MIN_PIXELS`](crate::observations::MIN_PIXELS). Distant glimpses do not count.
+    /// [`MIN_PIXELS`](crate::observations::MIN_PIXELS). Views of fewer pixels are ignored.
     pub min_views: usize,
     /// Smallest support: mean IoU with masks, 0 to 1.
     pub min_support: f32,
@@ -40,11 +40,11 @@ pub struct Chosen {
     pub overlaps: Overlaps,
     /// For each id, 0 included: area of its Gaussians summed over all views, in units of a view's
     /// area.
-    pub shown: Vec<f32>,
+    pub id_areas: Vec<f32>,
     /// Support of each object by masks.
     pub support: Vec<Support>,
-    /// Numbers of rejected sets: too few views; too little support; duplicates, or more than 16
-    /// bits can number.
+    /// Numbers of rejected sets: with too few views; with too little support; duplicates, or sets
+    /// beyond the limit of 16-bit ids.
     pub dropped: [usize; 3],
 }
 
@@ -82,7 +82,7 @@ impl Chosen {
 ///
 /// `pixels`: mean number of pixels of a view.
 pub fn choose(
-    sightings: &Observations,
+    observations: &Observations,
     sets: Vec<Proposal>,
     support: Vec<Support>,
     pixels: usize,
@@ -108,8 +108,8 @@ pub fn choose(
         })
     });
 
-    let weights: Vec<f32> = (0..sightings.gaussians() as u32)
-        .map(|g| sightings.weight(g))
+    let weights: Vec<f32> = (0..observations.gaussians() as u32)
+        .map(|g| observations.weight(g))
         .collect();
     let weight = |set: &[u32]| -> f32 { set.iter().map(|g| weights[*g as usize]).sum() };
     let mut kept = SetsByGaussian::new(weights.len());
@@ -148,12 +148,12 @@ pub fn choose(
     };
     let lists: Vec<Vec<u16>> = holders.of.into_iter().map(list).collect();
     (chosen.overlaps, chosen.ids) =
-        Overlaps::of(&lists, &chosen.parents, &weights, overlaps::LISTED);
+        Overlaps::of(&lists, &chosen.parents, &weights, overlaps::LISTED_SHARE);
     let shown: Vec<f32> = weights
         .iter()
         .map(|weight| weight / pixels as f32)
         .collect();
-    chosen.shown = chosen
+    chosen.id_areas = chosen
         .overlaps
         .sums(chosen.parents.len(), &chosen.ids, &shown);
     chosen.support = objects.into_iter().map(|o| o.2).collect();
@@ -231,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn supported_sets_are_objects_by_falling_size_and_may_overlap() {
+    fn supported_sets_become_overlapping_objects_in_descending_size() {
         // A part that extends beyond its object, an object, an unsupported part, and a neighbour
         // that overlaps the object.
         let found = chosen(
@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn of_two_that_are_nearly_the_same_the_better_one_stays() {
+    fn of_near_duplicates_the_best_supported_set_is_kept() {
         let found = chosen(
             &[(0..8, 0.6), (0..19, 0.9), (0..20, 0.8)],
             &SelectionConfig::default(),

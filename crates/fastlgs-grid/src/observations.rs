@@ -184,7 +184,7 @@ impl<'a> Observations<'a> {
         };
         let firsts: Vec<MaskId> = tables.iter().map(&mut place).collect();
         let of_view = |((seen, table), first)| ViewMasks::new(seen, table, first);
-        let held: Vec<ViewMasks> = views
+        let view_masks: Vec<ViewMasks> = views
             .into_par_iter()
             .zip(tables)
             .zip(firsts)
@@ -199,7 +199,11 @@ impl<'a> Observations<'a> {
                 .map(|atoms| atoms.iter().map(|a| of_atom[usize::from(*a)]).sum())
                 .collect()
         };
-        let pixels = held.par_iter().map(pixels).collect::<Vec<_>>().concat();
+        let pixels = view_masks
+            .par_iter()
+            .map(pixels)
+            .collect::<Vec<_>>()
+            .concat();
         let first_atom = (0..=tables.len())
             .map(|v| tables[..v].iter().map(|t| t.count() as u32).sum())
             .collect();
@@ -207,7 +211,7 @@ impl<'a> Observations<'a> {
             votes,
             begin,
             tables,
-            view_masks: held,
+            view_masks,
             first_atom,
             pixels,
         }

@@ -5,14 +5,14 @@
 
 use std::collections::BTreeMap;
 
-/// Object lists that are no chain of parents. Id K + 1 + i denotes list i, in descending order
-/// of id: small objects come first.
+/// Object lists that are not a chain of parents. Id K + 1 + i denotes list i. A list holds object
+/// ids in descending order, so small objects come first.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Overlaps(pub Vec<Vec<u16>>);
 
-/// Share of the total weight whose lists get ids of their own. Many lists at borders occur in a few
-/// Gaussians only.
-pub const LISTED: f32 = 0.98;
+/// Share of the total weight of the Gaussians whose lists get ids of their own. The other lists are
+/// mostly at object borders, each for a few Gaussians.
+pub const LISTED_SHARE: f32 = 0.98;
 
 impl Overlaps {
     /// Numbers object lists; returns the overlap lists and the id of each input list.
@@ -134,7 +134,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lists_are_numbered_and_found_again() {
+    fn object_lists_get_ids_and_can_be_recovered() {
         // Objects 2 and 3 lie in 1. Some Gaussians of 3 lie in 2 as well; some of 2 lie outside 1.
         let parents = [0, 1, 1];
         let lists = vec![
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn rare_lists_are_taken_for_what_is_nearest() {
+    fn rare_lists_get_the_id_of_the_most_similar_list() {
         let parents = [0, 0, 0];
         let lists = vec![vec![3, 2, 1], vec![3, 2], vec![3, 1], vec![3], vec![2, 1]];
         let (overlaps, ids) = Overlaps::of(&lists, &parents, &[1.0, 50.0, 0.5, 50.0, 0.1], 0.98);
@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_keeps_a_number_for_its_own_objects() {
+    fn representative_id_prefers_an_id_of_exactly_these_objects() {
         let lists = [vec![], vec![1], vec![2, 1], vec![3, 2], vec![3, 1]];
         let number = |objects: &[u16], found: &[(u16, f32)]| {
             representative_id(objects, found.iter().copied(), &lists)

@@ -43,14 +43,14 @@ pub struct Hit {
 /// Evidence of a query for one object.
 #[derive(Clone, Copy, Debug)]
 pub struct Evidence {
-    /// Log-odds that the query means this object, up to a constant: likeness plus the logarithm of
-    /// its share of the surface.
+    /// Log-odds that the query means this object, up to a constant: calibrated cosine plus the
+    /// logarithm of its share of the surface.
     pub rank: f32,
     /// Calibrated cosine: log-odds without the share of the surface.
-    pub likeness: f32,
+    pub calibrated_cosine: f32,
     /// Share of absent names whose best margin is smaller than this object's, 0 to 1.
     pub score: f32,
-    /// Standard error of rank and likeness over the object's views.
+    /// Standard error of rank and calibrated cosine over the object's views.
     pub error: f32,
 }
 
@@ -78,7 +78,7 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
         else {
             return Evidence {
                 rank: f32::NEG_INFINITY,
-                likeness: f32::NEG_INFINITY,
+                calibrated_cosine: f32::NEG_INFINITY,
                 score: 0.0,
                 error: 0.0,
             };
@@ -86,18 +86,18 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
         if query.from_example && object.embeddings.iter().all(|e| query.positive.contains(e)) {
             return Evidence {
                 rank: f32::INFINITY,
-                likeness: f32::INFINITY,
+                calibrated_cosine: f32::INFINITY,
                 score: 1.0,
                 error: 0.0,
             };
         }
-        let likeness = calibration.temperature * cosine;
+        let calibrated_cosine = calibration.temperature * cosine;
         let variance = mean_over_views(object, |e| (query.cosine(e) - cosine).powi(2))
             / object.embeddings.len() as f32;
         let anything = mean_over_views(object, |e| query.canonical(e));
         Evidence {
-            rank: likeness + share.min(1.0 - share).max(equal).ln(),
-            likeness,
+            rank: calibrated_cosine + share.min(1.0 - share).max(equal).ln(),
+            calibrated_cosine,
             score: calibration.confidence(cosine - anything, seen),
             error: calibration.temperature * variance.sqrt(),
         }
@@ -187,8 +187,8 @@ pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
     hits.into_iter().map(|h| h.1).collect()
 }
 
-/// Smallest support, relative to the best candidate, of an object that is preferred to its own
-/// part.
+/// Smallest odds, relative to those of the best candidate, at which a larger object is preferred to
+/// its part.
 pub const SUPPORT_SHARE: f32 = 0.98;
 
 /// Assumed share of clicks that miss the target.
@@ -222,15 +222,15 @@ pub fn select_at_pixels(grid: &Grid, pixels: &[Vec<u16>]) -> (Vec<u16>, Option<u
         .iter()
         .map(|id| odds(*id))
         .fold(f32::NEG_INFINITY, f32::max);
-    let meant = candidates
+    let target = candidates
         .iter()
         .find(|id| odds(**id) >= SUPPORT_SHARE.ln() + best)
         .copied();
-    (candidates.into_iter().rev().collect(), meant)
+    (candidates.into_iter().rev().collect(), target)
 }
 
-/// Returns the highest score of the objects, which decides whether the query is answered; 0 without
-/// objects.
+/// Returns the highest score of the objects; 0 without objects. It decides whether the query is
+/// answered.
 pub fn best_score(ranked: &[Hit]) -> f32 {
     ranked.iter().map(|hit| hit.score).fold(0.0, f32::max)
 }
@@ -238,11 +238,11 @@ pub fn best_score(ranked: &[Hit]) -> f32 {
 /// Returns the targets; empty means "not found".
 ///
 /// The first target is the found object with the highest rank. Others are added if they do not
-/// overlap a target. Their rank and likeness may be lower than the first one's by at most the
-/// combined standard error.
+/// overlap a target. Their rank and calibrated cosine may be lower than the first one's by at most
+/// the combined standard error.
 ///
-/// Likeness must agree as well: size may make a large object the best answer, but not a second one
-/// of a kind.
+/// The calibrated cosine must agree as well. Size alone may make a large object the first target,
+/// but not a further one.
 pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConfig) -> Vec<Hit> {
     let evidence = evidence(grid, query);
     let of = |hit: &Hit| evidence[usize::from(hit.id) - 1];
@@ -259,7 +259,7 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
         if chosen.len() >= config.top_k || first.rank - own.rank > own.error.hypot(first.error) {
             break;
         }
-        let alike = own.likeness >= first.likeness - own.error.hypot(first.error);
+        let alike = own.calibrated_cosine >= first.calibrated_cosine - own.error.hypot(first.error);
         if alike && !taken[usize::from(hit.id) - 1] {
             chosen.push(*hit);
             taken
@@ -368,7 +368,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn the_right_object_is_found_and_absence_is_said() {
+    fn present_names_are_found_and_absent_names_are_not() {
         let config = QueryConfig::default();
         assert_eq!(find(&grid(), [1.0, 0.0], &config), [1]);
         assert_eq!(find(&grid(), [0.0, 1.0], &config), [3]);
@@ -386,7 +386,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn the_heat_map_is_hottest_where_the_mask_is() {
+    fn heat_map_is_highest_at_the_targets() {
         // A small object has the higher score, but a large one is the target.
         let hit = |id, score| Hit { id, score };
         let found = Found {
@@ -402,12 +402,13 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn of_things_that_are_as_like_the_text_the_larger_is_meant() {
+    fn of_equally_similar_objects_the_larger_ranks_first() {
         let mut grid = grid();
         grid.objects
             .iter_mut()
             .for_each(|object| object.embeddings = vec![vec![0.999, 0.045]]);
-        grid.objects.push(known(4, 0, 0.5, vec![[0.0, 1.0]]));
+        grid.objects
+            .push(object_with_cosines(4, 0, 0.5, vec![[0.0, 1.0]]));
         // Surface of each object without its parts. The last object covers half of the scene.
         for (places, id) in [
             ([0.1, 0.2, 0.1, 0.15, 0.55], 1),
@@ -424,7 +425,7 @@ pub(crate) mod tests {
     }
 
     /// An object with given cosines: for each view, with the text and with a canonical phrase.
-    fn known(id: u16, parent: u16, area: f32, cosines: Vec<[f32; 2]>) -> Object {
+    fn object_with_cosines(id: u16, parent: u16, area: f32, cosines: Vec<[f32; 2]>) -> Object {
         let (code, areas, views) = (Vec3::ZERO, vec![area; cosines.len()], cosines.len());
         Object {
             id,
@@ -438,8 +439,9 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_fragment_needs_more_likeness_than_a_large_thing() {
-        let thing = |id, area, cosine: f32| known(id, 0, area, vec![[cosine, 0.0]; 3]);
+    fn a_small_object_needs_a_larger_cosine() {
+        let thing =
+            |id, area, cosine: f32| object_with_cosines(id, 0, area, vec![[cosine, 0.0]; 3]);
         let first = |fragment: f32| {
             let others = (3..40).map(|id| thing(id, 0.01, 0.1));
             let grid = Grid {
@@ -457,7 +459,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn with_clips_statistics_the_text_decides() {
+    fn with_clip_statistics_rank_is_as_good_as_cosine() {
         let rng = &mut Rng::new(5, "clip");
         let mut scene = || -> Grid {
             let mut objects: Vec<Object> = Vec::new();
@@ -474,7 +476,12 @@ pub(crate) mod tests {
                 let right = if id == 1 { 0.08 } else { 0.0 };
                 let own = 0.20 + right + 0.02 * rng.normal();
                 let cosines = (0..5).map(|_| [own, 0.21 + 0.015 * rng.normal()]).collect();
-                objects.push(known(id, parent, around * rng.range(0.05, 0.6), cosines));
+                objects.push(object_with_cosines(
+                    id,
+                    parent,
+                    around * rng.range(0.05, 0.6),
+                    cosines,
+                ));
             }
             // Exchanges it with a random object.
             let place = 1 + (rng.uniform() * 199.0) as usize;
@@ -515,13 +522,13 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_click_means_a_thing_and_not_all_there_is() {
+    fn a_click_selects_an_object_not_the_whole_scene() {
         // Object 1 is the whole scene, with full support; 2 is an object in it; 3 is a part of 2
         // with less support.
         let object = |id: u16, parent: u16, support: f32| Object {
             support,
             parent,
-            ..known(id, parent, 0.1, vec![[0.5, 0.5]])
+            ..object_with_cosines(id, parent, 0.1, vec![[0.5, 0.5]])
         };
         let objects = vec![object(1, 0, 1.0), object(2, 1, 0.9), object(3, 2, 0.7)];
         let grid = Grid {
@@ -554,11 +561,11 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn clicks_on_two_parts_mean_what_holds_both_and_one_may_go_beside() {
+    fn clicks_on_two_parts_select_their_whole_and_one_may_miss() {
         let object = |id: u16, parent: u16| Object {
             support: 0.8,
             parent,
-            ..known(id, parent, 0.1, vec![[0.5, 0.5]])
+            ..object_with_cosines(id, parent, 0.1, vec![[0.5, 0.5]])
         };
         // Objects 2 and 3 are parts of 1, which covers 0.4 of the scene; 4 is the rest.
         let objects = vec![object(1, 0), object(2, 1), object(3, 1), object(4, 0)];
@@ -582,7 +589,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn nothing_is_meant_where_all_is_ruled_out() {
+    fn no_target_if_all_objects_are_excluded() {
         let config = QueryConfig {
             false_alarms: 1.0,
             ..QueryConfig::default()
@@ -595,7 +602,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_is_nearer_to_a_negative_is_not_meant() {
+    fn objects_nearer_to_a_negative_are_excluded() {
         let mut query = query([0.95, 0.31]);
         let find = |query: &TextQuery| {
             ids(&select(
@@ -611,7 +618,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn one_view_that_fools_the_encoder_counts_little() {
+    fn one_misrecognised_view_has_little_influence() {
         let seen = |recognised: usize| {
             let view = |k: usize| {
                 if k < recognised {
@@ -655,7 +662,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_was_shown_is_meant_beyond_doubt() {
+    fn the_example_object_itself_ranks_first() {
         let mut grid = grid();
         // A larger object with nearly the same embedding.
         (grid.objects[2].embeddings, grid.objects[2].areas) = (vec![vec![0.81, 0.586]], vec![0.9]);
@@ -672,7 +679,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn parts_are_looked_for_inside_their_object() {
+    fn parts_are_searched_inside_the_targets() {
         let targets = [Hit { id: 1, score: 0.9 }];
         let ask = |text| {
             part(&grid(), &targets, &query(text), &QueryConfig::default())
@@ -687,7 +694,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn several_of_a_kind_are_found_together() {
+    fn similar_objects_are_found_together() {
         let mut grid = grid();
         // Two similar objects, whose difference is within the variation between views.
         let alike = |k: usize| -> Vec<Vec<f32>> {

@@ -2,7 +2,7 @@
 
 use crate::calibration::Calibration;
 
-/// Canonical phrases (LERF).
+/// Canonical phrases: those of LERF, without "things".
 pub const CANONICAL: [&str; 3] = ["object", "stuff", "texture"];
 
 /// Factor on cosines before the softmax. It is in LERF's code, not in its paper.
@@ -39,9 +39,9 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
 
 impl TextQuery {
     /// Returns a text query without canonical and negative embeddings.
-    pub fn new(meant: Vec<Vec<f32>>, calibration: Calibration) -> Self {
+    pub fn new(positive: Vec<Vec<f32>>, calibration: Calibration) -> Self {
         Self {
-            positive: meant,
+            positive,
             from_example: false,
             canonical: Vec::new(),
             negatives: Vec::new(),
@@ -51,10 +51,10 @@ impl TextQuery {
     }
 
     /// Returns a query from examples, without canonical and negative embeddings.
-    pub fn of_examples(meant: Vec<Vec<f32>>, calibration: Calibration) -> Self {
+    pub fn of_examples(positive: Vec<Vec<f32>>, calibration: Calibration) -> Self {
         Self {
             from_example: true,
-            ..Self::new(meant, calibration)
+            ..Self::new(positive, calibration)
         }
     }
 
@@ -64,7 +64,8 @@ impl TextQuery {
         1.0 / (1.0 + (TEMPERATURE * (self.canonical(embedding) - self.cosine(embedding))).exp())
     }
 
-    /// Returns the largest cosine of an embedding with a canonical phrase, at least `min_canonical`.
+    /// Returns the largest cosine of an embedding with a canonical phrase; at least
+    /// `min_canonical`.
     pub fn canonical(&self, embedding: &[f32]) -> f32 {
         self.canonical
             .iter()

@@ -9,15 +9,15 @@ use rayon::prelude::*;
 pub struct Support {
     /// Mean IoU with the best mask of each view, weighted by the set's pixels there; 0 to 1.
     pub iou: f32,
-    /// (pixels, view) of each view that shows at least [`MIN_PIXELS`](crate::observations::MIN_PIXELS)
-    /// of it.
+    /// (pixels, view) of each view that shows at least
+    /// [`MIN_PIXELS`](crate::observations::MIN_PIXELS) of it.
     pub areas: Vec<(u32, u32)>,
 }
 
 /// Computes the support of each set.
-pub fn support(sightings: &Observations, sets: &[Proposal]) -> Vec<Support> {
+pub fn support(observations: &Observations, sets: &[Proposal]) -> Vec<Support> {
     let of = |scratch: &mut _, set: &Proposal| {
-        let shown = sightings.view_fits(&set.set, scratch);
+        let shown = observations.view_fits(&set.set, scratch);
         let (pixels, common) = shown.iter().fold((0.0, 0.0), |(pixels, common), s| {
             (
                 pixels + s.pixels,
@@ -34,7 +34,7 @@ pub fn support(sightings: &Observations, sets: &[Proposal]) -> Vec<Support> {
     };
     sets.par_iter()
         .with_min_len(16)
-        .map_init(|| sightings.scratch(), of)
+        .map_init(|| observations.scratch(), of)
         .collect()
 }
 

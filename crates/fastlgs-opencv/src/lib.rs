@@ -1,4 +1,4 @@
-//! The system's OpenCV: each function behind one plain C function.
+//! Bindings to the system's OpenCV. Each function has a C wrapper in a `.cpp` file.
 
 pub mod inpaint;
 pub mod sift;
@@ -24,8 +24,8 @@ fn side(length: u32) -> Result<c_int> {
     c_int::try_from(length).map_err(|_| Error::Side(length))
 }
 
-/// Calls a C function that returns a number from 0 on, or -1 with a reason. The function writes the
-/// reason as a zero-terminated text to the buffer of the given size.
+/// Calls a C wrapper, which receives a buffer and its size in bytes. The wrapper returns 0 or more,
+/// or -1 after it has written a zero-terminated reason into the buffer.
 fn checked(what: &'static str, call: impl FnOnce(*mut c_char, usize) -> c_int) -> Result<usize> {
     let mut reason = [0 as c_char; 256];
     let returned = call(reason.as_mut_ptr(), reason.len());

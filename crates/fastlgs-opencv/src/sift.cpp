@@ -1,4 +1,4 @@
-// OpenCV's SIFT behind one plain function, so that its headers and a C++ compiler are all that a build needs of it.
+// A C interface to OpenCV's SIFT. A build needs only OpenCV's headers and a C++ compiler.
 #include <opencv2/features2d.hpp>
 
 #include <algorithm>
@@ -6,12 +6,14 @@
 #include <cstdio>
 #include <vector>
 
-// Key points of a grey picture of `width` x `height` bytes: at most `capacity` positions (x, y as OpenCV counts them) and descriptors of 128
-// bytes. Returns their number, or -1 with a reason in `reason`.
+// Detects the `most` strongest key points of the grey picture `pixels` [height][width], and those
+// that are as strong as the last of them. Writes at most `capacity` of them: `positions`
+// [capacity][2] (x, y in OpenCV's coordinates, see sift.rs) and `descriptors` [capacity][128].
+// Returns their number, or -1 with a zero-terminated reason of at most `reason_size` bytes.
 extern "C" int fastlgs_opencv_sift(const uint8_t *pixels, int width, int height, int most, int capacity, float *positions,
                                    uint8_t *descriptors, char *reason, size_t reason_size) {
     try {
-        // OpenCV takes no pictures that cannot be written to, but does not write here.
+        // cv::Mat takes only mutable pointers. The picture is not written to.
         const cv::Mat picture(height, width, CV_8UC1, const_cast<uint8_t *>(pixels));
         // Half of the usual contrast threshold: evenly lit walls have weak corners only.
         const auto sift = cv::SIFT::create(most, 3, 0.02, 10.0, 1.6);

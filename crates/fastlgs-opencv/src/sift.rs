@@ -19,15 +19,15 @@ unsafe extern "C" {
     ) -> c_int;
 }
 
-/// Positions in pixels, and 128-byte descriptors.
-pub type Found = (Vec<Vec2>, Vec<[u8; 128]>);
+/// Positions in pixels, where (0, 0) is the corner of the photo, and the descriptors.
+pub type Detected = (Vec<Vec2>, Vec<[u8; 128]>);
 
 /// Detects and describes the `most` strongest key points. Key points as strong as the last of these
 /// are added, up to 2 x `most` in all.
 ///
 /// # Errors
 /// When OpenCV refuses the picture.
-pub fn detect(photo: &GrayImage, most: usize) -> Result<Found> {
+pub fn detect(photo: &GrayImage, most: usize) -> Result<Detected> {
     let capacity = 2 * most;
     let mut positions = vec![[0.0f32; 2]; capacity];
     let mut descriptors = vec![[0u8; 128]; capacity];
@@ -48,8 +48,8 @@ pub fn detect(photo: &GrayImage, most: usize) -> Result<Found> {
         )
     })?;
     descriptors.truncate(count);
-    // OpenCV counts from the centre of the first pixel of a doubled picture, which lies 0.25 pixels
-    // from the photo's corner.
+    // SIFT doubles the picture first. OpenCV's origin is the centre of the first doubled pixel,
+    // 0.25 photo pixels from the photo's corner.
     let positions = positions[..count]
         .iter()
         .map(|[x, y]| Vec2::new(x + 0.25, y + 0.25))

@@ -43,6 +43,7 @@ pub struct Scene {
     opened: Mutex<Opened>,
 }
 
+/// The scene and its object table.
 struct Opened {
     scene: fastlgs::Scene,
     grid: Arc<Grid>,

@@ -102,8 +102,8 @@ impl Sink for EventSink<'_> {
 }
 
 /// Waits for the next event. A receiver is not `Sync`; `&mut` makes the borrow `Send`.
-fn wait(heard: &mut Receiver<Event>) -> Result<Event, RecvTimeoutError> {
-    heard.recv_timeout(SIGNAL_INTERVAL)
+fn wait(receiver: &mut Receiver<Event>) -> Result<Event, RecvTimeoutError> {
+    receiver.recv_timeout(SIGNAL_INTERVAL)
 }
 
 /// Runs `work` with the GIL released. `progress` is called with a dictionary for each event.
@@ -121,7 +121,7 @@ pub fn run<T: Send>(
     fork::check()?;
     let cancelled = AtomicBool::new(false);
     std::thread::scope(|scope| {
-        let (events, mut heard) = channel();
+        let (events, mut receiver) = channel();
         let cancelled = &cancelled;
         let thread = scope.spawn(move || {
             let listener = EventSink {
@@ -136,7 +136,7 @@ pub fn run<T: Send>(
         });
         let mut interruption = None;
         loop {
-            let event = py.detach(|| wait(&mut heard));
+            let event = py.detach(|| wait(&mut receiver));
             let called = match &event {
                 Ok(event) => progress
                     .as_ref()

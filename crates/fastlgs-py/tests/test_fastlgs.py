@@ -1,4 +1,4 @@
-"""The whole way from Python: a generated scene is preprocessed, trained and asked."""
+"""End-to-end tests from Python: a generated scene is preprocessed, trained and queried."""
 
 import json
 import os
@@ -44,14 +44,14 @@ def test_questions_are_answered(scene):
     assert cat.mask.shape == cat.relevancy.shape == (height, width) and cat.mask.dtype == bool
     assert cat.report["pixels"] == cat.mask.sum()
     assert scene.query("cat", view=view, false_alarms=0.0).found is False
-    # What a pixel shows is the object that is drawn there.
+    # A query by a pixel finds the object that is rendered there.
     drawn = scene.render(view, "objects")
     y, x = np.argwhere(drawn > 0)[0]
     pointed = scene.query(point=(int(x), int(y)), view=view)
     assert pointed.found and pointed.mask[y, x]
     several = scene.query(point=[[int(x), int(y)], (int(x), int(y))], view=view)
     assert [o["id"] for o in several.objects] == [o["id"] for o in pointed.objects]
-    # A picture of where the thing is.
+    # A query by a picture.
     shown = scene.query(image=scene.render(view), view=view, false_alarms=1.0)
     assert shown.text == "image"
 
@@ -126,7 +126,7 @@ def test_ctrl_c_and_a_callback_that_raises_end_a_stage(scene, tmp_path):
 
     with pytest.raises(Enough):
         fastlgs.train(folder, iterations=200_000, progress=stop, device="cpu")
-    # The earlier result is whole.
+    # The earlier result is unchanged.
     assert fastlgs.Scene(folder, device="cpu").views == scene.views
 
 
@@ -147,7 +147,7 @@ def test_other_threads_go_on(scene):
 
 
 def test_own_masks_and_embeddings(scene, tmp_path):
-    """Masks and embeddings as a segmenter and a CLIP in the caller's process would give them."""
+    """Masks and embeddings come from the caller, as from a segmenter and CLIP in Python."""
     photos = tmp_path / "photos"
     fastlgs.synth("room", photos, views=16, size=(160, 120))
     largest = sorted(scene.objects, key=lambda o: -o["area"])[:6]
@@ -174,7 +174,7 @@ def test_own_masks_and_embeddings(scene, tmp_path):
         iou = (answer.mask & truth).sum() / (answer.mask | truth).sum()
         right += iou > 0.5
     assert right >= len(things) - 2, f"{right} of {len(things)}"
-    assert not asked.query("nothing of the kind"), "like none of the things"
+    assert not asked.query("nothing of the kind"), "its embedding is similar to no object"
     with pytest.raises(fastlgs.Error, match="no such photo"):
         fastlgs.write_masks(photos, "none.png", np.zeros((1, 4, 4), dtype=bool))
     with pytest.raises(fastlgs.Error, match="2 masks need as many rows"):

@@ -18,7 +18,7 @@ const DIFFERENCE_PX: f32 = 0.25;
 /// Scale of the robust loss, as a residual of a colour channel (0 to 1). Moved objects and
 /// highlights exceed it and lose weight.
 const RESIDUAL_SCALE: f32 = 0.1;
-/// Steps at a quarter, half and full resolution.
+/// Numbers of Gauss-Newton steps at a quarter, half and full resolution.
 pub const STEPS: [usize; 3] = [4, 2, 2];
 /// Levels whose shorter side has fewer pixels are skipped.
 const MIN_SIDE: u32 = 24;
@@ -26,7 +26,7 @@ const MIN_SIDE: u32 = 24;
 /// Rotation vector and translation in camera space: q becomes exp(rotation) q + translation.
 type Motion = [f32; 6];
 
-fn moved(camera: &Camera, motion: &Motion) -> Camera {
+fn move_camera(camera: &Camera, motion: &Motion) -> Camera {
     let turn = Quat::from_scaled_axis(Vec3::new(motion[0], motion[1], motion[2]));
     let motion = Mat4::from_rotation_translation(turn, Vec3::new(motion[3], motion[4], motion[5]));
     Camera {
@@ -35,24 +35,24 @@ fn moved(camera: &Camera, motion: &Motion) -> Camera {
     }
 }
 
-/// Returns `target`'s camera at the nearby pose from which the engine's scene looks most like the
-/// photo.
+/// Returns the camera of `target` at the nearby pose whose render is most similar to the photo.
 ///
-/// `frame` makes the view of a camera. `steps` are the steps at a quarter, half and full
-/// resolution. The camera stays unchanged if its view is opaque nowhere.
+/// `view_of` returns the view of a camera. `steps` are the numbers of steps at a quarter, half and
+/// full resolution. The camera is returned unchanged if no pixel of its render is opaque
+/// (transmittance below 0.5).
 ///
 /// # Errors
 /// As [`Engine::render`].
 pub fn align(
     engine: &mut dyn Engine,
-    frame: impl Fn(&Camera) -> View,
+    view_of: impl Fn(&Camera) -> View,
     target: &Target,
     exposure: &Exposure,
     steps: [usize; 3],
 ) -> Result<Camera> {
     let half = target.halved();
     let quarter = half.halved();
-    let Some(depth) = median_depth(engine, frame(&target.camera))? else {
+    let Some(depth) = median_depth(engine, view_of(&target.camera))? else {
         return Ok(target.camera.clone());
     };
     let mut pose = target.camera.world_to_camera;
@@ -65,12 +65,12 @@ pub fn align(
             ..level.camera.clone()
         };
         let mut damping = 1e-3;
-        let mut render = |camera: &Camera| residuals_of(engine, frame(camera), level, exposure);
-        let mut now = render(&camera)?;
+        let mut render = |camera: &Camera| residuals_of(engine, view_of(camera), level, exposure);
+        let mut residuals = render(&camera)?;
         // The pose from the coarser level may fit this level worse than the given pose.
-        let given = render(&level.camera)?;
-        if cost(&given) < cost(&now) {
-            (camera, now) = (level.camera.clone(), given);
+        let start_residuals = render(&level.camera)?;
+        if cost(&start_residuals) < cost(&residuals) {
+            (camera, residuals) = (level.camera.clone(), start_residuals);
         }
         for _ in 0..steps {
             let pixel = DIFFERENCE_PX / camera.fx;
@@ -86,11 +86,11 @@ pub fn align(
             for (k, size) in sizes.into_iter().enumerate() {
                 let mut motion = Motion::default();
                 motion[k] = size;
-                slopes.push(render(&moved(&camera, &motion))?);
+                slopes.push(render(&move_camera(&camera, &motion))?);
             }
             let (mut normal, mut right) =
                 (SMatrix::<f64, 6, 6>::zeros(), SVector::<f64, 6>::zeros());
-            for (p, r) in now.iter().enumerate() {
+            for (p, r) in residuals.iter().enumerate() {
                 let row = SVector::<f32, 6>::from_fn(|k, _| slopes[k][p] - r);
                 let weight = weight(*r);
                 normal += (row * row.transpose() * weight).cast::<f64>();
@@ -100,10 +100,10 @@ pub fn align(
             let Some(step) = normal.cholesky().map(|factors| factors.solve(&right)) else {
                 break;
             };
-            let next = moved(&camera, &std::array::from_fn(|k| step[k] as f32 * sizes[k]));
-            let then = render(&next)?;
-            if cost(&then) < cost(&now) {
-                (camera, now, damping) = (next, then, damping * 0.1);
+            let next = move_camera(&camera, &std::array::from_fn(|k| step[k] as f32 * sizes[k]));
+            let next_residuals = render(&next)?;
+            if cost(&next_residuals) < cost(&residuals) {
+                (camera, residuals, damping) = (next, next_residuals, damping * 0.1);
             } else {
                 damping *= 100.0;
             }
@@ -118,7 +118,7 @@ pub fn align(
 
 /// Moves all cameras by one rigid motion that restores their mean pose. Photos do not determine
 /// where the scene as a whole lies.
-pub(crate) fn keep_mean(before: &[Camera], after: &mut [Camera]) {
+pub(crate) fn restore_mean_pose(before: &[Camera], after: &mut [Camera]) {
     let n = before.len().max(1) as f32;
     let middle = before.iter().map(Camera::centre).sum::<Vec3>() / n;
     // Rigid motion M of the world for each camera, with after * M = before.
@@ -149,7 +149,7 @@ fn cost(residuals: &[f32]) -> f64 {
         .sum()
 }
 
-/// Returns rendered minus photographed colour, `[channel][pixel]`; 0 at pixels that do not count.
+/// Returns rendered minus photographed colour, `[3][h][w]`; 0 at pixels that the loss ignores.
 fn residuals_of(
     engine: &mut dyn Engine,
     view: View,
@@ -159,9 +159,9 @@ fn residuals_of(
     let frame = engine.render(view, Channels::Color)?;
     let difference = |(c, value, packed): (usize, &f32, &u32)| {
         let bytes = packed.to_le_bytes();
-        let shown = exposure.gain[c] * value + exposure.offset[c];
+        let rendered = exposure.gain[c] * value + exposure.offset[c];
         if bytes[3] == 255 {
-            shown - f32::from(bytes[c]) / 255.0
+            rendered - f32::from(bytes[c]) / 255.0
         } else {
             0.0
         }

@@ -3,8 +3,8 @@
 //! The scene first grows up to the limit. Then each Gaussian is scored by how much the training
 //! views would change without it alone, as in Optimal Brain Damage (LeCun et al. 1990); see
 //! [`Engine::saliency`](crate::Engine::saliency). Gaussians are removed in ascending order of their scores, while the sum stays below
-//! `MAX_REMOVED_SHARE` times the squared error of the views. Fewer are removed if the removal costs more
-//! than `MAX_REMOVAL_COST` dB.
+//! `MAX_REMOVED_SHARE` times the squared error of the views. Fewer are removed if the removal costs
+//! more than `MAX_REMOVAL_COST` dB.
 //!
 //! The limit is a share of the error. So an accurate scene keeps faint Gaussians, and an inaccurate
 //! one loses those that could only fit noise. Together, the removed Gaussians cost more than the
@@ -16,22 +16,24 @@ use serde::{Deserialize, Serialize};
 /// Largest sum of the scores removed at once, as a share of the squared error of the training
 /// views.
 const MAX_REMOVED_SHARE: f64 = 0.05;
-/// Largest loss of PSNR right after a removal, in dB: twice the squared error. Where a scene fits
-/// its photos badly, nearly all Gaussians are affordable one by one, but not together.
+/// Largest loss of PSNR right after a removal, in dB; 3.01 dB is twice the squared error. In a
+/// scene that fits its photos badly, the sum of scores alone would permit the removal of nearly all
+/// Gaussians.
 const MAX_REMOVAL_COST: f64 = 3.01;
 /// Number of times that the share is halved before nothing is removed.
 const HALVINGS: usize = 9;
 /// Largest loss of PSNR on the validation views when the SH degree is lowered, in dB.
 pub const DEGREE_LOSS: f64 = 0.02;
 /// One of this many training views is a validation view.
-pub(crate) const WATCHED: usize = 10;
-/// With fewer views left to train on, there are no validation views: of 28 views, holding out three
-/// cost 1.7 dB.
+pub(crate) const VALIDATION_INTERVAL: usize = 10;
+/// Smallest number of views that must remain besides the validation views. With fewer, there are no
+/// validation views: of 28 views, holding out three cost 1.7 dB.
 const MIN_TRAINED_VIEWS: usize = 40;
 
 /// Returns whether training view `index` of `count` is a validation view while the scene grows.
-pub(crate) fn is_watched(index: usize, count: usize) -> bool {
-    count >= MIN_TRAINED_VIEWS + count / WATCHED && index % WATCHED == WATCHED / 2
+pub(crate) fn is_validation_view(index: usize, count: usize) -> bool {
+    count >= MIN_TRAINED_VIEWS + count / VALIDATION_INTERVAL
+        && index % VALIDATION_INTERVAL == VALIDATION_INTERVAL / 2
 }
 
 /// A removal of Gaussians and its cost, for reports.
@@ -44,7 +46,7 @@ pub struct Removal {
     /// Gaussians after it.
     pub after: usize,
     /// PSNR in dB before it, on the validation views or, if there are none, on every tenth view;
-    /// `None` if no pixel counts.
+    /// `None` if the photos have no pixels to compare.
     pub psnr_before: Option<f64>,
     /// The same right after it, before the remaining Gaussians are refined.
     pub psnr_after: Option<f64>,
@@ -72,17 +74,17 @@ pub(crate) fn candidates(changes: &[f32], squared_error: f64) -> impl Iterator<I
 /// Returns the indices that remain when the smallest changes are removed, up to the sum
 /// `affordable`. Returns all indices if none would remain.
 fn remaining(changes: &[f32], affordable: f64) -> Vec<usize> {
-    let mut places: Vec<usize> = (0..changes.len()).collect();
-    places.sort_by(|&a, &b| changes[a].total_cmp(&changes[b]).then(a.cmp(&b)));
+    let mut indices: Vec<usize> = (0..changes.len()).collect();
+    indices.sort_by(|&a, &b| changes[a].total_cmp(&changes[b]).then(a.cmp(&b)));
     let mut sum = 0.0;
-    let removed = places.iter().take_while(|&&i| {
+    let removed = indices.iter().take_while(|&&i| {
         sum += f64::from(changes[i]);
         sum <= affordable
     });
     let removed = removed.count();
-    let mut stay = places.split_off(if removed < changes.len() { removed } else { 0 });
-    stay.sort_unstable();
-    stay
+    let mut kept = indices.split_off(if removed < changes.len() { removed } else { 0 });
+    kept.sort_unstable();
+    kept
 }
 
 #[cfg(test)]
@@ -95,7 +97,7 @@ mod tests {
     use glam::Vec3;
 
     #[test]
-    fn what_no_photo_shows_goes_and_what_makes_a_difference_stays() {
+    fn gaussians_that_views_hardly_show_are_removed() {
         let camera = Camera::look_at(
             "a",
             Vec3::new(0.0, 0.0, -4.0),
@@ -140,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn less_and_less_goes_until_a_removal_is_bearable() {
+    fn candidates_keep_more_and_more_and_costly_removals_are_rejected() {
         let changes: Vec<f32> = (0..100).map(|i| 0.01 * i as f32).collect();
         let stay: Vec<usize> = candidates(&changes, 100.0)
             .map(|places| places.len())
@@ -160,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn what_goes_adds_up_to_what_is_affordable() {
+    fn removed_changes_sum_to_at_most_the_limit() {
         assert_eq!(remaining(&[0.5, 0.0, 0.4, 0.3, 9.0], 1.0), [0, 4]);
         assert_eq!(
             remaining(&[0.5, 0.0, 0.4, 0.3, 9.0], 0.0),

@@ -49,7 +49,7 @@ fn tensors_path(path: &Path, iteration: u32) -> PathBuf {
 /// Writes `path.json` and the tensor file that it names, then removes older tensor files.
 pub(crate) fn save(
     path: &Path,
-    course: &TrainingState,
+    training: &TrainingState,
     state: &State,
     stats: &[f32],
 ) -> Result<()> {
@@ -61,9 +61,9 @@ pub(crate) fn save(
         ("moment2", shape, &state.moment2),
         ("stats", vec![2, n], stats),
     ];
-    let keep = tensors_path(path, course.iteration);
+    let keep = tensors_path(path, training.iteration);
     save_tensors(&keep, &tensors)?;
-    fs::write_json(&path.with_extension("json"), course)?;
+    fs::write_json(&path.with_extension("json"), training)?;
     tensors_of(path)
         .filter(|old| *old != keep)
         .for_each(|old| drop(std::fs::remove_file(old)));
@@ -103,13 +103,13 @@ pub(crate) fn load(path: &Path) -> Result<Option<(TrainingState, State, Vec<f32>
     if !header.is_file() {
         return Ok(None);
     }
-    let course: TrainingState = fs::read_json(&header)?;
-    let tensors_path = tensors_path(path, course.iteration);
+    let training: TrainingState = fs::read_json(&header)?;
+    let tensors_path = tensors_path(path, training.iteration);
     let mut tensors = load_tensors(&tensors_path)?;
     let mut take = |name: &str, rows: usize| {
         let found = tensors
             .remove(name)
-            .filter(|t| t.0 == [rows, course.gaussians])
+            .filter(|t| t.0 == [rows, training.gaussians])
             .map(|t| t.1);
         found.ok_or_else(|| {
             fastlgs_core::Error::format(
@@ -118,7 +118,7 @@ pub(crate) fn load(path: &Path) -> Result<Option<(TrainingState, State, Vec<f32>
             )
         })
     };
-    let sh_degree = course.config.sh_degree;
+    let sh_degree = training.config.sh_degree;
     let rows = channels(sh_degree);
     let state = State {
         sh_degree,
@@ -127,5 +127,5 @@ pub(crate) fn load(path: &Path) -> Result<Option<(TrainingState, State, Vec<f32>
         moment2: take("moment2", rows)?,
     };
     let stats = take("stats", 2)?;
-    Ok(Some((course, state, stats)))
+    Ok(Some((training, state, stats)))
 }

@@ -130,9 +130,9 @@ impl State {
         }
     }
 
-    /// Keeps only the Gaussians with the indices `places`, in this order.
-    pub fn keep(&mut self, places: &[usize]) {
-        let sources: Vec<(usize, bool)> = places.iter().map(|&i| (i, false)).collect();
+    /// Keeps only the Gaussians with these indices, in this order.
+    pub fn keep(&mut self, indices: &[usize]) {
+        let sources: Vec<(usize, bool)> = indices.iter().map(|&i| (i, false)).collect();
         *self = self.gathered(&sources);
     }
 
@@ -145,7 +145,7 @@ impl State {
         self.keep(&morton_order(&means));
     }
 
-    /// Removes Gaussians whose mean lies in free space. Returns how many.
+    /// Removes the Gaussians for whose mean `free` returns true. Returns their number.
     pub(crate) fn remove_where(&mut self, free: impl Fn(Vec3) -> bool + Sync) -> usize {
         let n = self.len();
         let places: Vec<usize> = (0..n)
@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn faint_go_small_are_cloned_large_are_split() {
+    fn faint_gaussians_are_pruned_small_cloned_and_large_split() {
         let mut scene = Gaussians::default();
         scene.push_sphere(Vec3::ZERO, 0.001, 0.5, [0.5; 3]);
         scene.push_sphere(Vec3::X, 0.5, 0.5, [0.5; 3]);
@@ -307,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn the_budget_is_hard() {
+    fn refine_never_exceeds_the_budget() {
         let mut scene = Gaussians::default();
         (0..10).for_each(|i| scene.push_sphere(Vec3::splat(i as f32), 0.5, 0.5, [0.5; 3]));
         let mut s = state(&scene);
@@ -320,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_number_goes() {
+    fn gaussians_with_values_that_are_not_finite_are_removed() {
         let mut scene = Gaussians::default();
         (0..4).for_each(|i| scene.push_sphere(Vec3::splat(i as f32), 0.5, 0.5, [0.5; 3]));
         scene.means[1].x = f32::NAN;

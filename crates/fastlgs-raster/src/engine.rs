@@ -102,7 +102,7 @@ pub struct TargetImage {
     pub feature: Vec<u32>,
 }
 
-/// Packs a pixel of a target image. The loss ignores pixels that do not count.
+/// Packs a pixel of a target image. `counts`: whether the loss uses the pixel.
 pub fn pack(values: [u8; 3], counts: bool) -> u32 {
     u32::from_le_bytes([
         values[0],
@@ -118,8 +118,8 @@ impl TargetImage {
         4 * (self.color.len() + self.feature.len())
     }
 
-    /// Returns `[2][padded rows][padded columns]`, the layout on the device. Pixels without a
-    /// feature do not count.
+    /// Returns `[2][padded rows][padded columns]`, the layout on the device. The feature
+    /// loss ignores pixels without a feature.
     pub(crate) fn padded(&self, view: &View) -> Vec<u32> {
         let mut planes = self.color.clone();
         planes.extend(&self.feature);

@@ -18,21 +18,21 @@ use fastlgs_core::dataset::SfmPoint;
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Fewer training views than these count as few: other views may not contradict what one view
-/// shows.
+/// Free space is used with fewer training views than this: other views may then not contradict a
+/// floater.
 pub const FEW_VIEWS: usize = 25;
 /// Share of the depth of a point up to which space is free.
 const FREE_SHARE: f32 = 0.85;
-/// Longer side of the depth maps in pixels: the resolution at which photos are compared for points.
+/// Longer side of the depth maps in pixels: that of the plane sweep, which computes the points.
 const DEPTH_MAP_SIDE: u32 = 240;
-/// Distance in pixels up to which a point frees the pixels around its own.
+/// Distance in pixels from the projection of a point up to which space in front of it is free.
 const FREE_RADIUS: usize = 1;
-/// Distance in pixels up to which a point limits the free space of the pixels around its own. Thin
-/// objects have few points, and between these only the wall behind has points. With 0, views of
-/// wires lose 1.2 dB; with 8, nothing.
+/// Distance in pixels from the projection of a point up to which free space ends before the point.
+/// Thin objects have few points, and between these only the wall behind has points. With 0, views
+/// of wires lose 1.2 dB; with 8, nothing.
 const LIMIT_RADIUS: usize = 8;
-/// Cameras that must agree on a point. Two are too few: two lines of sight meet wherever both
-/// cameras look.
+/// Smallest number of cameras that must see a point. With two, a wrong match also gives a point:
+/// each point on one line of sight lies on some line of sight of the other camera.
 const MIN_CAMERAS: usize = 3;
 /// Share of the median depth of the first Gaussians up to which space near a camera is free. It is
 /// less if more than one in `OUTLIER` of them would lie in it.
@@ -71,21 +71,21 @@ impl CameraFreeSpace {
         if depths.len() >= MIN_GAUSSIANS {
             let share = NEAR_SHARE * depths[depths.len() / 2];
             near = share.min(depths[depths.len() / OUTLIER]);
-            // Other cameras may see what this one does not, so only few of these Gaussians can be
-            // wrong.
+            // Other cameras may see Gaussians that this one does not, so at most MIN_GAUSSIANS of
+            // them are treated as outliers.
             radius = share.min(distances[(distances.len() / OUTLIER).min(MIN_GAUSSIANS)]);
         }
         let pixels = (camera.width * camera.height) as usize;
-        let (mut known, mut nearest) = (vec![false; pixels], vec![f32::INFINITY; pixels]);
+        let (mut near_a_point, mut nearest) = (vec![false; pixels], vec![f32::INFINITY; pixels]);
         for (pixel, depth) in seen
             .iter()
             .filter_map(|point| camera.pixel_and_depth(*point))
         {
-            neighbourhood(&camera, pixel, FREE_RADIUS).for_each(|at| known[at] = true);
+            neighbourhood(&camera, pixel, FREE_RADIUS).for_each(|at| near_a_point[at] = true);
             neighbourhood(&camera, pixel, LIMIT_RADIUS)
                 .for_each(|at| nearest[at] = nearest[at].min(depth));
         }
-        let depth = known
+        let depth = near_a_point
             .into_iter()
             .zip(nearest)
             .map(|(known, nearest)| {
@@ -121,8 +121,12 @@ pub(crate) fn neighbourhood(
     reach: usize,
 ) -> impl Iterator<Item = usize> {
     let [width, height] = [camera.width, camera.height].map(|side| side as usize);
-    let beside = |at: usize, side: usize| at.saturating_sub(reach)..(at + reach + 1).min(side);
-    let (columns, rows) = (beside(pixel % width, width), beside(pixel / width, height));
+    let range_around =
+        |at: usize, side: usize| at.saturating_sub(reach)..(at + reach + 1).min(side);
+    let (columns, rows) = (
+        range_around(pixel % width, width),
+        range_around(pixel / width, height),
+    );
     rows.flat_map(move |y| columns.clone().map(move |x| y * width + x))
 }
 
@@ -159,7 +163,7 @@ impl FreeSpace {
     }
 
     /// Returns whether a position lies in free space.
-    pub(crate) fn holds(&self, place: Vec3) -> bool {
+    pub(crate) fn contains(&self, place: Vec3) -> bool {
         self.0.iter().any(|free| free.contains(place))
     }
 }
@@ -197,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_camera_sees_a_point_through_is_free() {
+    fn space_between_a_camera_and_a_point_is_free() {
         // The second camera stands aside, the third looks away.
         let away = Camera::look_at(
             "b",
@@ -218,33 +222,33 @@ mod tests {
             ],
         );
         assert!(
-            free.holds(-Vec3::Z) && free.holds(-3.9 * Vec3::Z),
+            free.contains(-Vec3::Z) && free.contains(-3.9 * Vec3::Z),
             "in front of the nearer point, seen from the first camera"
         );
-        assert!(!free.holds(-0.5 * Vec3::Z), "too near to the point");
+        assert!(!free.contains(-0.5 * Vec3::Z), "too near to the point");
         assert!(
-            !free.holds(Vec3::Z) && !free.holds(-5.0 * Vec3::Z),
+            !free.contains(Vec3::Z) && !free.contains(-5.0 * Vec3::Z),
             "behind the point, and behind the camera"
         );
         assert!(
-            free.holds(Vec3::new(1.5, 0.0, 0.0)),
+            free.contains(Vec3::new(1.5, 0.0, 0.0)),
             "in front of the farther point, seen from the second camera"
         );
         for seen_by in [vec![], vec![0, 1]] {
             assert!(
-                !FreeSpace::of(&cameras, &[], &[point(Vec3::ZERO, &seen_by)]).holds(-Vec3::Z),
+                !FreeSpace::of(&cameras, &[], &[point(Vec3::ZERO, &seen_by)]).contains(-Vec3::Z),
                 "too few cameras agree: {seen_by:?}"
             );
         }
         let many: Vec<Camera> = (0..FEW_VIEWS).map(|k| camera(0.01 * k as f32)).collect();
         assert!(
-            !FreeSpace::of(&many, &[], &[point(Vec3::ZERO, &[0, 1, 2])]).holds(-Vec3::Z),
+            !FreeSpace::of(&many, &[], &[point(Vec3::ZERO, &[0, 1, 2])]).contains(-Vec3::Z),
             "with many views no space is free"
         );
     }
 
     #[test]
-    fn a_point_speaks_for_few_pixels_and_limits_more() {
+    fn a_point_frees_near_pixels_and_limits_farther_ones() {
         // Twice as wide as the depth maps.
         let wide = Camera::look_at(
             "a",
@@ -272,25 +276,25 @@ mod tests {
         };
         let one = free(&[(100.0, 4.0)]);
         let reach = FREE_RADIUS as f32;
-        assert!(one.holds(at(100.0 - reach, 3.0)) && one.holds(at(100.0 + reach, 3.0)));
+        assert!(one.contains(at(100.0 - reach, 3.0)) && one.contains(at(100.0 + reach, 3.0)));
         assert!(
-            !one.holds(at(99.0 - reach, 3.0)) && !one.holds(at(101.0 + reach, 3.0)),
+            !one.contains(at(99.0 - reach, 3.0)) && !one.contains(at(101.0 + reach, 3.0)),
             "no point is near these pixels"
         );
         let two = |apart: f32| free(&[(100.0, 4.0), (100.0 + apart, 2.0)]);
         let (near, far) = (two(LIMIT_RADIUS as f32), two((LIMIT_RADIUS + 1) as f32));
         assert!(
-            !near.holds(at(100.0, 3.0)) && near.holds(at(100.0, 1.0)),
+            !near.contains(at(100.0, 3.0)) && near.contains(at(100.0, 1.0)),
             "free only up to the nearer point beside it"
         );
         assert!(
-            far.holds(at(100.0, 3.0)),
+            far.contains(at(100.0, 3.0)),
             "the nearer point is too far beside it"
         );
     }
 
     #[test]
-    fn what_hangs_before_a_camera_is_no_part_of_the_scene() {
+    fn space_near_a_camera_is_free() {
         let row = |count: usize, first: f32, z: f32| {
             (0..count).map(move |k| Vec3::new(0.01 * k as f32 + first, 0.0, z))
         };
@@ -298,18 +302,24 @@ mod tests {
         // One Gaussian is wrong.
         means.push(Vec3::new(0.0, 0.0, -3.9));
         let free = FreeSpace::of(&[camera(0.0), camera(0.3)], &means, &[]);
-        assert!(free.holds(Vec3::new(0.0, 0.0, -3.3)) && free.holds(Vec3::new(0.3, 0.0, -3.5)));
         assert!(
-            !free.holds(Vec3::new(0.0, 0.0, -1.0)),
+            free.contains(Vec3::new(0.0, 0.0, -3.3)) && free.contains(Vec3::new(0.3, 0.0, -3.5))
+        );
+        assert!(
+            !free.contains(Vec3::new(0.0, 0.0, -1.0)),
             "far enough from the cameras"
         );
-        assert!(free.holds(Vec3::new(-0.5, 0.0, -4.2)), "around the cameras");
         assert!(
-            !free.holds(Vec3::new(2.0, 0.0, -3.5)),
+            free.contains(Vec3::new(-0.5, 0.0, -4.2)),
+            "around the cameras"
+        );
+        assert!(
+            !free.contains(Vec3::new(2.0, 0.0, -3.5)),
             "far beside the views of the cameras"
         );
         let free_before = |means: &[Vec3]| {
-            FreeSpace::of(&[camera(0.0), camera(0.3)], means, &[]).holds(Vec3::new(-0.5, 0.0, -4.2))
+            FreeSpace::of(&[camera(0.0), camera(0.3)], means, &[])
+                .contains(Vec3::new(-0.5, 0.0, -4.2))
         };
         let walled: Vec<Vec3> = means.iter().copied().chain(row(500, -2.5, -4.3)).collect();
         assert!(
@@ -317,12 +327,12 @@ mod tests {
             "many Gaussians behind the cameras are a wall"
         );
         assert!(
-            !FreeSpace::of(&[camera(0.0)], &means[..10], &[]).holds(Vec3::new(0.0, 0.0, -3.0)),
+            !FreeSpace::of(&[camera(0.0)], &means[..10], &[]).contains(Vec3::new(0.0, 0.0, -3.0)),
             "ten Gaussians are too few"
         );
         let near_point = [point(Vec3::new(0.0, 0.0, -3.9), &[0, 1, 2])];
         assert!(
-            FreeSpace::of(&[camera(0.0)], &means, &near_point).holds(Vec3::new(0.0, 0.0, -3.3)),
+            FreeSpace::of(&[camera(0.0)], &means, &near_point).contains(Vec3::new(0.0, 0.0, -3.3)),
             "a nearer point does not reduce free space"
         );
     }

@@ -38,7 +38,8 @@ pub fn from_points(points: &[SfmPoint]) -> Gaussians {
     scene
 }
 
-/// Random pixels that are tried before one is used that does not count.
+/// Largest number of random pixels that are tried. If the loss ignores all of them, the last one is
+/// used.
 const TRIES: usize = 32;
 
 /// Returns `count` random points in front of the views, the same number for each view.
@@ -92,7 +93,7 @@ const RADIUS_FACTOR: f32 = 2.0;
 /// pixels.
 const BACKDROP_OPACITY: f32 = 0.9;
 
-/// Returns a backdrop for few photos: at most `most` nearly opaque Gaussians on a sphere.
+/// Returns a backdrop for few photos: at most `max_count` nearly opaque Gaussians on a sphere.
 ///
 /// The sphere surrounds the common focus, all cameras, and all but a few of `points`. Its Gaussians
 /// have the colours of the photos. They cover the parts of the photos that show no point nearby.
@@ -102,14 +103,14 @@ const BACKDROP_OPACITY: f32 = 0.9;
 ///
 /// # Errors
 /// When a photo cannot be read.
-pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gaussians> {
+pub fn backdrop(views: &Targets, points: &[SfmPoint], max_count: usize) -> Result<Gaussians> {
     let focus = common_focus(&views.cameras);
     let mut distances: Vec<f32> = points
         .iter()
         .map(|point| point.position.distance(focus))
         .collect();
     distances.sort_by(f32::total_cmp);
-    let room = RADIUS_FACTOR
+    let min_radius = RADIUS_FACTOR
         * views
             .cameras
             .iter()
@@ -117,29 +118,29 @@ pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gau
             .fold(0.0, f32::max);
     let radius = distances
         .get(((1.0 - OUTSIDE_SHARE) * distances.len() as f32) as usize)
-        .map_or(room, |farthest| farthest.max(room));
+        .map_or(min_radius, |farthest| farthest.max(min_radius));
     let mut scene = Gaussians::default();
     for id in 0..views.len() {
         let Target { camera, image, .. } = views.get(id)?;
         let cells = camera.shrunk_to(CELLS);
         let [width, height] = [cells.width, cells.height].map(|side| side as usize);
-        let mut known = vec![false; width * height];
+        let mut covered = vec![false; width * height];
         // Include the Gaussians that earlier photos added.
-        let shown = points
+        let projected_points = points
             .iter()
             .map(|point| point.position)
             .chain(scene.means.iter().copied());
-        for (cell, _) in shown.filter_map(|place| cells.pixel_and_depth(place)) {
-            neighbourhood(&cells, cell, 1).for_each(|at| known[at] = true);
+        for (cell, _) in projected_points.filter_map(|place| cells.pixel_and_depth(place)) {
+            neighbourhood(&cells, cell, 1).for_each(|at| covered[at] = true);
         }
-        let turn = Mat3::from_mat4(camera.world_to_camera).transpose();
+        let camera_to_world = Mat3::from_mat4(camera.world_to_camera).transpose();
         let from = camera.centre() - focus;
-        for cell in (0..width * height).filter(|cell| !known[*cell]) {
+        for cell in (0..width * height).filter(|cell| !covered[*cell]) {
             let middle = Vec2::new((cell % width) as f32 + 0.5, (cell / width) as f32 + 0.5);
-            let ray = turn * cells.ray(middle).normalize();
+            let ray = camera_to_world * cells.ray(middle).normalize();
             // Distance to the point where the ray leaves the sphere.
             let towards = from.dot(ray);
-            let way = (towards * towards + radius * radius - from.length_squared())
+            let distance = (towards * towards + radius * radius - from.length_squared())
                 .max(0.0)
                 .sqrt()
                 - towards;
@@ -149,19 +150,19 @@ pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gau
             ];
             let [r, g, b, counts] =
                 image.color[y as usize * camera.width as usize + x as usize].to_le_bytes();
-            // The radius is 0 if all cameras stand in one place and no points are known.
-            if counts == 255 && way > 0.0 {
+            // The radius is 0 if all cameras have the same position and there are no points.
+            if counts == 255 && distance > 0.0 {
                 scene.push_sphere(
-                    camera.centre() + way * ray,
-                    way / cells.fx,
+                    camera.centre() + distance * ray,
+                    distance / cells.fx,
                     BACKDROP_OPACITY,
                     [r, g, b].map(|c| f32::from(c) / 255.0),
                 );
             }
         }
     }
-    let kept: Vec<usize> = (0..scene.len().min(most))
-        .map(|k| k * scene.len() / most.min(scene.len()))
+    let kept: Vec<usize> = (0..scene.len().min(max_count))
+        .map(|k| k * scene.len() / max_count.min(scene.len()))
         .collect();
     Ok(scene.select(&kept))
 }
@@ -191,7 +192,7 @@ mod tests {
     use crate::TargetImage;
 
     #[test]
-    fn points_in_one_place_are_one() {
+    fn points_at_one_position_give_one_gaussian() {
         let point = |x: f32| SfmPoint {
             position: Vec3::X * x,
             color: [9; 3],
@@ -220,7 +221,7 @@ mod tests {
         assert!((common_focus(&cameras) - target).length() < 1e-3);
     }
 
-    /// Four photos from around the origin, each of one colour. Their right third does not count.
+    /// Four photos from around the origin, each of one colour. The loss ignores their right third.
     fn photos() -> Targets {
         let eyes = [Vec3::X, Vec3::Z, -Vec3::X, -Vec3::Z].map(|eye| 4.0 * eye);
         let target = |(k, eye): (usize, &Vec3)| {
@@ -246,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn a_backdrop_stands_behind_all_where_photos_show_no_points() {
+    fn backdrop_covers_the_parts_of_photos_without_points() {
         let views = photos();
         // A ball of radius 1, and one wrong point far away.
         let mut points: Vec<SfmPoint> = (0..200)

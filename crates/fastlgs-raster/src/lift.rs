@@ -96,7 +96,7 @@ mod tests {
     use glam::Vec3;
 
     #[test]
-    fn a_gaussian_votes_for_what_it_covers() {
+    fn votes_are_blending_weights_by_label() {
         let camera = Camera::look_at(
             "a",
             Vec3::new(0.0, 0.0, -4.0),

@@ -173,7 +173,7 @@ impl<'a> Recorder<'a> {
             .submit(std::mem::replace(&mut self.encoder, self.gpu.encoder()));
     }
 
-    /// Submits the recorded passes. Returns how many further passes may run on the CPU.
+    /// Submits the recorded passes. Returns the number of further passes to run as CPU twins.
     pub fn submit(mut self) -> usize {
         self.flush();
         self.on_cpu

@@ -39,7 +39,7 @@ pub enum Alignment {
 pub struct TrainerConfig {
     /// Optimiser steps.
     pub iterations: u32,
-    /// Seed of view order, splitting and left-out Gaussians.
+    /// Seed of view order, splitting and dropped Gaussians.
     pub seed: u64,
     /// Largest number of Gaussians, and whether unimportant ones are removed.
     pub budget: Budget,
@@ -67,8 +67,9 @@ pub struct TrainerConfig {
     pub exposure: bool,
     /// Whether the cameras of the training views are aligned.
     pub alignment: Alignment,
-    /// Step after which the caller lets masks shape the Gaussians
-    /// ([`Trainer::couple`](crate::Trainer::couple)).
+    /// Step after which the feature loss moves geometry too; `None` for never. The caller of
+    /// [`Trainer::run`](crate::Trainer::run) then calls
+    /// [`Trainer::couple`](crate::Trainer::couple).
     #[serde(default)]
     pub couples_at: Option<u32>,
 }
@@ -100,8 +101,8 @@ impl Default for TrainerConfig {
 const REFINE_FROM: f32 = 0.05;
 /// Target number of rounds of density control in a run, within the limits of `BETWEEN_ROUNDS`.
 const ROUNDS: u32 = 16;
-/// Fewest and most steps between two rounds. Fewer steps measure gradients badly, more waste a long
-/// run.
+/// Smallest and largest number of steps between two rounds. After fewer steps, mean gradients are
+/// noisy. With more, a long run has too few rounds.
 const BETWEEN_ROUNDS: [u32; 2] = [25, 100];
 /// Steps between opacity resets (3DGS).
 const RESET_EVERY: u32 = 3000;

@@ -23,8 +23,8 @@ impl Shape {
 
     /// Returns (chunks, workgroups) in which `n` items are sorted and summed.
     pub fn chunks(self, n: u32) -> (u32, u32) {
-        // An invocation of a software adapter owns a chunk: enough chunks for all threads, few
-        // enough totals to sum.
+        // On a software adapter, one invocation processes one chunk. SERIAL chunks occupy all
+        // threads, and their totals are quick to sum.
         const SERIAL: u32 = 256;
         const SHARED: u32 = 2048;
         if self == Shape::Wide {

@@ -30,9 +30,9 @@ impl Target {
 }
 
 impl TargetImage {
-    /// Returns the image at half the resolution, from the pixels of each 2x2 block that count.
-    /// Colours are averaged. Of codes the most frequent is taken, because the mean of two codes may
-    /// be near that of a third object.
+    /// Returns the image at half the resolution. In each 2x2 block, only pixels that the loss uses
+    /// contribute. Colours are averaged. Of codes, the most frequent one is used, because the mean
+    /// of two codes may be near the code of a third object.
     pub(crate) fn halved(&self) -> Self {
         let [w, h] = self.size;
         let size = [w.div_ceil(2), h.div_ceil(2)];
@@ -66,8 +66,8 @@ impl TargetImage {
         }
     }
 
-    /// Returns the standard deviation of the brightness of the pixels that count (0 to 1), averaged
-    /// over the colours.
+    /// Returns the standard deviation of the brightness (0 to 1) of the pixels that the loss uses,
+    /// averaged over the colours.
     fn contrast(&self) -> f64 {
         let deviation = |c: usize| {
             let counting = self
@@ -197,10 +197,10 @@ impl Targets {
     }
 
     /// Returns the mean contrast of all images and their fingerprint. The contrast is the standard
-    /// deviation of the brightness of the pixels that count, 0 to 1, averaged over colours.
+    /// deviation of the brightness of the pixels that the loss uses, 0 to 1, averaged over colours.
     ///
     /// # Errors
-    /// When an image cannot be read, or no pixel counts.
+    /// When an image cannot be read, or the loss ignores all pixels.
     pub(crate) fn contrast_and_fingerprint(&self) -> Result<(f32, u64)> {
         let of_picture = |image: TargetImage| {
             let counts = image
@@ -254,7 +254,7 @@ fn mean(pixels: &[[u8; 4]]) -> [u8; 3] {
     })
 }
 
-/// Returns the most frequent pixel; of several, the first.
+/// Returns the most frequent pixel; of equally frequent ones, the first.
 fn mode(pixels: &[[u8; 4]]) -> [u8; 3] {
     let count = |pixel: &[u8; 4]| pixels.iter().filter(|p| *p == pixel).count();
     let [x, y, z, _] = pixels

@@ -59,8 +59,8 @@ pub struct View {
     /// Length of the runs of pairs in which `fold_slots` sums a Gaussian's slots; 1 if it does not
     /// run.
     pub(crate) fold_length: u32,
-    /// 1: Gaussians of transparent objects ([`fastlgs_core::gaussians::TRANSPARENT_LOGIT`]) are drawn as opaque
-    /// ones, to show which objects are where.
+    /// 1: Gaussians of transparent objects are drawn with an opacity of 0.9, to show which objects
+    /// are where. Their logit is at most [`fastlgs_core::gaussians::TRANSPARENT_LOGIT`].
     pub(crate) solid: u32,
     /// Padding to 16 bytes.
     pub(crate) unused: [u32; 2],

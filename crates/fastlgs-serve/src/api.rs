@@ -1,7 +1,7 @@
 //! Handlers of the HTTP interface. `web/openapi.json` describes it for programs.
 
 use crate::failure::Failure;
-use crate::guard::LARGEST_BODY;
+use crate::guard::MAX_BODY_BYTES;
 use crate::scene_worker::{SceneWorker, VisibleObjects};
 use crate::shared::AppState;
 use axum::Json;
@@ -24,9 +24,9 @@ use serde_json::{Value, json};
 use std::sync::Arc;
 
 /// Largest picture that is rendered for a request, in pixels.
-const MOST_PIXELS: u32 = 1 << 22;
+const MAX_PIXELS: u32 = 1 << 22;
 /// Longest text of a query or name, in characters.
-const LONGEST_TEXT: usize = 300;
+const MAX_TEXT_CHARACTERS: usize = 300;
 /// Largest number of negative texts of a query.
 const MOST_NEGATIVES: usize = 8;
 
@@ -40,14 +40,14 @@ pub async fn scene(State(app): App) -> Answer {
         "views": app.views()?,
         "trained_here": app.live.is_some(),
         "up": mean_up(&app.cameras()).to_array(),
-        "limits": { "pixels": MOST_PIXELS, "text": LONGEST_TEXT, "body": LARGEST_BODY },
+        "limits": { "pixels": MAX_PIXELS, "text": MAX_TEXT_CHARACTERS, "body": MAX_BODY_BYTES },
     });
-    let more = match app.bell() {
+    let more = match app.scene_handle() {
         None => {
             let live = app.live.as_ref().ok_or_else(Failure::busy)?;
             json!({ "stage": "training", "antialias": live.antialias, "background": live.background, "objects": 0 })
         }
-        Some(handle) => handle.ask(|worker| Ok(worker.description())).await?,
+        Some(handle) => handle.run(|worker| Ok(worker.description())).await?,
     };
     if let (Value::Object(all), Value::Object(more)) = (&mut value, more) {
         all.extend(more);
@@ -68,8 +68,8 @@ pub async fn training(State(app): App) -> Answer<Response> {
 
 /// `GET /api/splats`: returns the Gaussians, packed for browsers.
 pub async fn splats(State(app): App) -> Answer<Response> {
-    let data = match (app.bell(), &app.live) {
-        (Some(handle), _) => handle.ask(|worker| Ok(worker.splats())).await?,
+    let data = match (app.scene_handle(), &app.live) {
+        (Some(handle), _) => handle.run(|worker| Ok(worker.splats())).await?,
         (None, Some(live)) => live.splats(),
         (None, None) => return Err(Failure::busy()),
     };
@@ -78,7 +78,7 @@ pub async fn splats(State(app): App) -> Answer<Response> {
 
 /// `GET /api/objects`: lists all objects and parts in order of their ids.
 pub async fn objects(State(app): App) -> Answer {
-    app.ready()?.ask(|worker| Ok(Json(worker.objects()?))).await
+    app.ready()?.run(|worker| Ok(Json(worker.objects()?))).await
 }
 
 /// `GET /api/objects/{id}/thumbnail.png`: returns a small picture of an object.
@@ -86,7 +86,7 @@ pub async fn thumbnail(State(app): App, id: Result<Path<u16>, PathRejection>) ->
     let Path(id) = id?;
     let made = app
         .ready()?
-        .ask(move |worker| Ok(worker.thumbnail(id)?))
+        .run(move |worker| Ok(worker.thumbnail(id)?))
         .await?;
     let data = made
         .ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("no view shows object {id}")))?;
@@ -98,7 +98,7 @@ pub async fn best_view(State(app): App, id: Result<Path<u16>, PathRejection>) ->
     let Path(id) = id?;
     let view = app
         .ready()?
-        .ask(move |worker| Ok(worker.best_view(id)?))
+        .run(move |worker| Ok(worker.best_view(id)?))
         .await?;
     let view = view
         .ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("no view shows object {id}")))?;
@@ -116,12 +116,15 @@ pub struct NameRequest {
 /// `GET /api/names`: lists the names that were taught with the scene's encoder.
 pub async fn names(State(app): App) -> Answer {
     app.ready()?
-        .ask(|worker| Ok(Json(json!(worker.scene.taught_names()?))))
+        .run(|worker| Ok(Json(json!(worker.scene.taught_names()?))))
         .await
 }
 
 /// `POST /api/names`: teaches the name of an object. Later text queries find it.
-pub async fn name(State(app): App, request: Result<Json<NameRequest>, JsonRejection>) -> Answer {
+pub async fn teach_name(
+    State(app): App,
+    request: Result<Json<NameRequest>, JsonRejection>,
+) -> Answer {
     let Json(naming) = request?;
     let name = checked_text(&naming.name)?.to_owned();
     let work = move |worker: &mut SceneWorker| {
@@ -135,12 +138,12 @@ pub async fn name(State(app): App, request: Result<Json<NameRequest>, JsonReject
             ));
         }
         let learned = teach_object(&worker.scene, &worker.grid, &name, naming.object)?;
-        worker.scene.forget_texts();
+        worker.scene.drop_texts();
         Ok(Json(
             json!({ "name": learned.name, "object": learned.object, "views": learned.views, "examples": learned.examples }),
         ))
     };
-    app.ready()?.ask(work).await
+    app.ready()?.run(work).await
 }
 
 /// `GET /api/photos/{view}`: returns the prepared photo of a view.
@@ -201,23 +204,27 @@ fn camera_of(
         camera = camera.resized(w, h);
     }
     camera.check().map_err(Failure::bad_request)?;
-    if camera.width.saturating_mul(camera.height) > MOST_PIXELS {
+    if camera.width.saturating_mul(camera.height) > MAX_PIXELS {
         return Err(Failure::bad_request(format!(
             "{}x{} is too large: at most {} million pixels",
             camera.width,
             camera.height,
-            MOST_PIXELS / 1_000_000
+            MAX_PIXELS / 1_000_000
         )));
     }
     Ok(camera)
 }
 
+/// Returns the text without surrounding white space.
+///
+/// # Errors
+/// Status 400 if it is empty or too long.
 fn checked_text(text: &str) -> Answer<&str> {
     let text = text.trim();
     match text.chars().count() {
         0 => Err(Failure::bad_request("the text is empty")),
-        n if n > LONGEST_TEXT => Err(Failure::bad_request(format!(
-            "the text has {n} characters; at most {LONGEST_TEXT} are allowed"
+        n if n > MAX_TEXT_CHARACTERS => Err(Failure::bad_request(format!(
+            "the text has {n} characters; at most {MAX_TEXT_CHARACTERS} are allowed"
         ))),
         _ => Ok(text),
     }
@@ -250,14 +257,14 @@ pub struct QueryBody {
 
 /// `POST /api/query`: answers a query with the fields of `fastlgs query --json`.
 pub async fn query(State(app): App, request: Result<Json<QueryBody>, JsonRejection>) -> Answer {
-    let Json(asked) = request?;
+    let Json(body) = request?;
     let camera = camera_of(
         &app,
-        asked.view.as_deref(),
-        asked.camera.clone(),
-        asked.size.as_deref(),
+        body.view.as_deref(),
+        body.camera.clone(),
+        body.size.as_deref(),
     )?;
-    let ask = match (&asked.text, &asked.point, &asked.image) {
+    let object_query = match (&body.text, &body.point, &body.image) {
         (Some(text), None, None) => ObjectQuery::Text(checked_text(text)?.to_owned()),
         (None, Some(pixels), None) => match pixels.outside(&camera) {
             None => ObjectQuery::Point(pixels.clone()),
@@ -287,7 +294,7 @@ pub async fn query(State(app): App, request: Result<Json<QueryBody>, JsonRejecti
             ));
         }
     };
-    if asked
+    if body
         .false_alarms
         .is_some_and(|share| !(share > 0.0 && share < 1.0))
     {
@@ -295,26 +302,26 @@ pub async fn query(State(app): App, request: Result<Json<QueryBody>, JsonRejecti
             "false_alarms: give a number between 0 and 1, such as 0.05",
         ));
     }
-    if asked.negative.len() > MOST_NEGATIVES {
+    if body.negative.len() > MOST_NEGATIVES {
         return Err(Failure::bad_request(format!(
             "negative: at most {MOST_NEGATIVES} texts are allowed"
         )));
     }
-    let negatives = asked
+    let negatives = body
         .negative
         .iter()
         .map(|n| checked_text(n).map(str::to_owned))
         .collect::<Answer<Vec<_>>>()?;
-    let (want_mask, want_heat) = (asked.mask, asked.heatmap);
+    let (want_mask, want_heat) = (body.mask, body.heatmap);
     let choice = VisibleObjects {
-        hidden: asked.hidden,
-        only: asked.only,
+        hidden: body.hidden,
+        only: body.only,
     };
     let work = move |worker: &mut SceneWorker| {
         let defaults = QueryConfig::default();
         let config = QueryConfig {
-            false_alarms: asked.false_alarms.unwrap_or(defaults.false_alarms),
-            top_k: asked.top_k.unwrap_or(defaults.top_k).max(1),
+            false_alarms: body.false_alarms.unwrap_or(defaults.false_alarms),
+            top_k: body.top_k.unwrap_or(defaults.top_k).max(1),
         };
         if !worker.set_visible(&choice)? {
             return Err(Failure::bad_request(
@@ -323,12 +330,12 @@ pub async fn query(State(app): App, request: Result<Json<QueryBody>, JsonRejecti
         }
         let answer = worker
             .scene
-            .query(ask)
+            .query(object_query)
             .camera(&camera)
             .negatives(&negatives)
             .false_alarms(config.false_alarms)
             .top_k(config.top_k)
-            .candidates(asked.candidates.unwrap_or(CANDIDATES))
+            .candidates(body.candidates.unwrap_or(CANDIDATES))
             .run()?;
         let mask = (want_mask && answer.report.found)
             .then(|| mask_picture(&answer.mask, camera.width, camera.height));
@@ -344,7 +351,7 @@ pub async fn query(State(app): App, request: Result<Json<QueryBody>, JsonRejecti
         }
         Ok(Json(value))
     };
-    app.ready()?.ask(work).await
+    app.ready()?.run(work).await
 }
 
 fn data_url(picture: impl Into<DynamicImage>) -> Answer<Value> {
@@ -418,8 +425,9 @@ pub async fn render(
             })
         } else if let Some(text) = &text {
             let field = worker.scene.field(&camera, None)?;
-            let meaning = ObjectQuery::Text(text.clone()).embed(&worker.scene, &[])?;
-            let found = meaning.find(&worker.grid, &field, &camera, &QueryConfig::default())?;
+            let embedded_query = ObjectQuery::Text(text.clone()).embed(&worker.scene, &[])?;
+            let found =
+                embedded_query.find(&worker.grid, &field, &camera, &QueryConfig::default())?;
             heatmap(&color, &field.relevancy(&worker.grid, &found.heat()))
         } else if wanted.selected.is_empty() {
             color
@@ -439,7 +447,7 @@ pub async fn render(
         };
         Ok(image_io::encode_png(picture)?)
     };
-    let data = app.ready()?.ask(work).await?;
+    let data = app.ready()?.run(work).await?;
     Ok(([(header::CONTENT_TYPE, "image/png")], data).into_response())
 }
 
@@ -509,7 +517,7 @@ pub async fn export(
         )?;
         Ok(fastlgs_core::fs::read(&path)?)
     };
-    let data: Vec<u8> = app.ready()?.ask(work).await?;
+    let data: Vec<u8> = app.ready()?.run(work).await?;
     let mut headers = HeaderMap::new();
     let file_name: String = name
         .chars()

@@ -19,7 +19,7 @@ use tokio::sync::Semaphore;
 /// Largest number of simultaneous requests to `/api/`; further ones get status 503.
 const MAX_CONCURRENT: usize = 64;
 /// Largest body of a request, in bytes.
-pub const LARGEST_BODY: usize = 8 << 20;
+pub const MAX_BODY_BYTES: usize = 8 << 20;
 /// Number of bytes that are read from a body that is too large. A client that sends more may not
 /// receive the response.
 const MAX_DISCARDED_BODY: usize = 64 << 20;
@@ -142,20 +142,20 @@ fn is_api(request: &Parts) -> bool {
     request.uri.path().starts_with("/api/")
 }
 
-/// Reads a body of at most `most` bytes.
+/// Reads a body of at most `max_bytes` bytes.
 ///
 /// A longer body is read but not kept, up to a limit: a client that is still sending would lose an
 /// early response.
 ///
 /// # Errors
 /// Status 413 if the body is too large, 408 if it does not arrive completely or in time.
-async fn read_body(mut body: Body, most: usize) -> Result<Vec<u8>, Failure> {
+async fn read_body(mut body: Body, max_bytes: usize) -> Result<Vec<u8>, Failure> {
     let (mut kept, mut arrived) = (Vec::new(), 0);
     let read = async {
         while let Some(frame) = body.frame().await {
             let data = frame.ok()?.into_data().unwrap_or_default();
             arrived += data.len();
-            if arrived <= most {
+            if arrived <= max_bytes {
                 kept.extend_from_slice(&data);
             } else if arrived > MAX_DISCARDED_BODY {
                 break;
@@ -164,12 +164,12 @@ async fn read_body(mut body: Body, most: usize) -> Result<Vec<u8>, Failure> {
         Some(())
     };
     match tokio::time::timeout(BODY_TIMEOUT, read).await {
-        Ok(Some(())) if arrived <= most => Ok(kept),
+        Ok(Some(())) if arrived <= max_bytes => Ok(kept),
         Ok(Some(())) => Err(Failure::new(
             StatusCode::PAYLOAD_TOO_LARGE,
             format!(
                 "the request is too large: at most {} MiB are allowed",
-                LARGEST_BODY >> 20
+                MAX_BODY_BYTES >> 20
             ),
         )),
         Ok(None) | Err(_) => Err(Failure::new(
@@ -195,7 +195,7 @@ pub async fn check(State(guard): State<Arc<Guard>>, request: Request, next: Next
     let body = read_body(
         body,
         if matches!(permit, Ok(Some(_))) {
-            LARGEST_BODY
+            MAX_BODY_BYTES
         } else {
             0
         },

@@ -77,7 +77,7 @@ impl Server {
             cameras: RwLock::new(Arc::new(folder.cameras()?)),
             folder: folder.clone(),
             live,
-            bell: OnceLock::new(),
+            scene_handle: OnceLock::new(),
             focus: OnceLock::new(),
         });
         let router = router(guard, shared.clone());
@@ -116,12 +116,12 @@ impl Server {
             .cameras
             .write()
             .unwrap_or_else(PoisonError::into_inner) = Arc::new(self.shared.folder.cameras()?);
-        let bell = SceneWorker::open(
+        let scene_handle = SceneWorker::open(
             self.shared.folder.root.clone(),
             device.to_owned(),
             clip_text,
         )?;
-        let _ = self.shared.bell.set(bell);
+        let _ = self.shared.scene_handle.set(scene_handle);
         Ok(())
     }
 
@@ -174,7 +174,7 @@ fn router(guard: Arc<Guard>, shared: Arc<AppState>) -> Router {
         .route("/api/objects", get(api::objects))
         .route("/api/objects/{id}/thumbnail.png", get(api::thumbnail))
         .route("/api/objects/{id}/view", get(api::best_view))
-        .route("/api/names", get(api::names).post(api::name))
+        .route("/api/names", get(api::names).post(api::teach_name))
         .route("/api/photos/{view}", get(api::photo))
         .route("/api/query", post(api::query))
         .route("/api/render", post(api::render))

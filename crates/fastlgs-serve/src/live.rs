@@ -125,7 +125,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pictures_are_made_for_those_who_watch_and_curves_stay_short() {
+    fn snapshots_are_taken_only_while_a_page_polls_and_curves_stay_short() {
         let live = Live::new(100_000, false, [0.0; 3]);
         let point = |iteration: u32| TrainStep {
             iteration,
@@ -137,11 +137,11 @@ mod tests {
         };
         live.set_snapshot(&Gaussians::default());
         live.state().last_snapshot = None;
-        assert!(!live.report(point(20), 30_000), "no one watches");
+        assert!(!live.report(point(20), 30_000), "no page polls");
         assert_eq!(live.progress().revision, 1);
         assert!(live.report(point(40), 30_000));
         live.set_snapshot(&Gaussians::default());
-        assert!(!live.report(point(60), 30_000), "the last picture is fresh");
+        assert!(!live.report(point(60), 30_000), "the snapshot is recent");
         for k in 4..5_000 {
             live.report(
                 TrainStep {

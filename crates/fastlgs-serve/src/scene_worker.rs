@@ -78,8 +78,8 @@ impl SceneWorker {
                 let open = || -> Result<Self> {
                     let mut worker = Self::new(&root, &device, clip_text)?;
                     worker.scene.warm_up()?;
-                    // Loads the text encoder before the first query. Without it, the page still shows
-                    // the scene.
+                    // Loads the text encoder before the first query. Without it, the page still
+                    // shows the scene.
                     if let Err(error) = worker.scene.text_query("warm up") {
                         tracing::warn!("text queries are not available: {error:#}");
                     }
@@ -220,7 +220,7 @@ impl SceneHandle {
     ///
     /// # Errors
     /// Errors of `work`, status 500 if it panics, and 503 if too many requests are waiting.
-    pub async fn ask<T: Send + 'static>(
+    pub async fn run<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut SceneWorker) -> Result<T, Failure> + Send + 'static,
     ) -> Result<T, Failure> {

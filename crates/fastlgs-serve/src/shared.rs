@@ -15,15 +15,18 @@ pub struct AppState {
     pub folder: SceneFolder,
     /// Current cameras; training may move them.
     pub cameras: RwLock<Arc<Vec<Camera>>>,
+    /// The training run, if the scene is trained by this process.
     pub live: Option<Arc<Live>>,
-    pub bell: OnceLock<SceneHandle>,
+    /// Handle of the scene worker, once the scene is opened.
+    pub scene_handle: OnceLock<SceneHandle>,
+    /// Distance from each camera to its subject, in scene units.
     pub focus: OnceLock<Vec<f32>>,
 }
 
 impl AppState {
     /// Returns the handle of the scene worker, or `None` during training.
-    pub fn bell(&self) -> Option<SceneHandle> {
-        self.bell.get().cloned()
+    pub fn scene_handle(&self) -> Option<SceneHandle> {
+        self.scene_handle.get().cloned()
     }
 
     /// Returns the handle of the scene worker.
@@ -31,7 +34,7 @@ impl AppState {
     /// # Errors
     /// Status 409 during training.
     pub fn ready(&self) -> Result<SceneHandle, Failure> {
-        self.bell().ok_or_else(|| {
+        self.scene_handle().ok_or_else(|| {
             Failure::new(
                 StatusCode::CONFLICT,
                 "the scene is still in training; try again when its objects are found",

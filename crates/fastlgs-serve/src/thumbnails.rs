@@ -22,7 +22,7 @@ const MARGIN: f32 = 0.15;
 pub struct Thumbnails {
     views: Vec<RgbImage>,
     best: Vec<Option<Best>>,
-    made: BTreeMap<u16, Vec<u8>>,
+    png_cache: BTreeMap<u16, Vec<u8>>,
 }
 
 /// The searched view in which an object has most pixels: index, number of pixels, and box (left,
@@ -42,13 +42,13 @@ fn step(scene: &Scene) -> usize {
 impl Thumbnails {
     /// Returns the thumbnail of an object as PNG, or `None` if no searched view shows it.
     pub fn png(&mut self, scene: &mut Scene, grid: &Grid, id: u16) -> Result<Option<Vec<u8>>> {
-        if !self.made.contains_key(&id) {
+        if !self.png_cache.contains_key(&id) {
             let Some(picture) = self.picture(scene, grid, id)? else {
                 return Ok(None);
             };
-            self.made.insert(id, image_io::encode_png(picture)?);
+            self.png_cache.insert(id, image_io::encode_png(picture)?);
         }
-        Ok(self.made.get(&id).cloned())
+        Ok(self.png_cache.get(&id).cloned())
     }
 
     /// Returns the thumbnail of an object, or `None` if no searched view shows it.

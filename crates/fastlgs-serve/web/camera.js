@@ -42,7 +42,7 @@ export class Camera {
     return [...this.eye, ...this.target(), ...this.down];
   }
 
-  // Sets the pose from such numbers. Returns false if they are no valid pose.
+  // Sets the pose from the numbers of `pose`. Returns false if they are not a valid pose.
   stand(pose) {
     const [eye, target, down] = [pose.slice(0, 3), pose.slice(3, 6), pose.slice(6, 9)];
     const forward = add(target, eye, -1);

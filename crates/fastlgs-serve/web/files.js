@@ -25,7 +25,7 @@ async function words() {
   return { list: new Map(list.map((word, place) => [word, place])), rows: new DataView(rows) };
 }
 
-// Normalises a text like `normalised` of crates/fastlgs/src/session/phrase.rs, in lower case.
+// Normalises a text like `normalised` of crates/fastlgs/src/query/phrase.rs, in lower case.
 function phrase(text) {
   const invisible = /[\u00ad\u200b-\u200f\u202a-\u202e\u2060-\u2064\ufeff]/g;
   const separators = /["`\u00b4\u00ab\u00bb()[\]{}<>\-_\u2010-\u2015\u2212\u2018-\u201f]|(?<![\p{L}\p{N}])'|'(?![\p{L}\p{N}])/gu;

@@ -10,7 +10,7 @@ const MAGIC = 0x53474c46, VERSION = 1, HEADER = 32;
 export function parseSplats(buffer) {
   const [magic, version, count, shDegree, texels] = new Uint32Array(buffer, 0, 5);
   const [colorRange, shRange] = new Float32Array(buffer, 20, 2);
-  if (magic !== MAGIC || version !== VERSION) throw new Error("the Gaussians have another version of the format; reload the page");
+  if (magic !== MAGIC || version !== VERSION) throw new Error("the server sends the Gaussians in another version of the format; reload the page");
   const rows = Math.max(1, Math.ceil(count * texels / ROW));
   const data = new Uint32Array(rows * ROW * 4);
   data.set(new Uint32Array(buffer, HEADER));

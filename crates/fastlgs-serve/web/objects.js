@@ -39,8 +39,8 @@ export class Objects {
     return this.children.get(id) ?? [];
   }
 
-  // Returns the largest object of a Gaussian id whose support is close to the best
-  // (fastlgs_grid::query::pointed).
+  // Returns the largest object of a Gaussian id whose support x (1 - share) is close to the best,
+  // like fastlgs_grid::query::select_at_pixels for one pixel.
   meant(id) {
     const chain = this.chain(id);
     const support = (id) => this.byId.get(id).support * (1 - this.byId.get(id).share);

@@ -8,8 +8,8 @@ const RENDERERS = [["webgpu", openWebGpu], ["webgl2", openWebGl2], ["pictures", 
 
 // Opens the renderer named `wish`, or the first that works in this browser.
 //
-// Browsers without a GPU show pictures of the server, which renders faster, unless `wish` names
-// another renderer. With `alone`, no server renders pictures.
+// Without a GPU, the server renders faster than the browser. The page then shows pictures of the
+// server, unless `wish` names another renderer. `alone`: there is no server that can render.
 export async function openRenderer(canvas, wish, alone) {
   const reasons = [];
   for (const [name, open] of RENDERERS) {

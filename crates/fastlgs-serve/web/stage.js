@@ -6,7 +6,8 @@ import { OBJECT_ROWS, parseSplats } from "./frame.js";
 import { openRenderer } from "./renderer.js";
 import { getBlob, getBytes } from "./server.js";
 
-// Largest longer side of the canvas in pixels. Software rasterisers are too slow for more.
+// Largest length of the canvas's longer side, in pixels. Software rasterisers are too slow for
+// more.
 const MOST_PIXELS = 1280;
 
 export class Stage {

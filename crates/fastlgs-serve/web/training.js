@@ -4,7 +4,7 @@ import { getJson } from "./server.js";
 
 const POLL_INTERVAL_MS = 1000;
 
-// Polls a run until the scene answers queries. Calls `grown` when there are new Gaussians.
+// Polls a run until the scene answers queries. Calls `onSplats` when there are new Gaussians.
 export async function follow(elements, onSplats) {
   elements.training.hidden = false;
   let revision = 0;

@@ -10,11 +10,11 @@ const MIN_MATCHES: usize = 8;
 const DARK: f32 = 8.0;
 /// Values from this one on (of 255) do not count: they may be clipped at white.
 const CLIPPED: f32 = 250.0;
-/// Weight, in matches, of the prior that a photo is as bright as it looks. It decides for photos
-/// and groups that no match connects to the others.
+/// Weight, in matches, of the prior that the brightness of a photo equals its apparent brightness.
+/// It matters only for photos and groups that no match connects to the others.
 const APPEARANCE_PRIOR_WEIGHT: f32 = 1e-2;
-/// Weight, in matches, of the prior that all channels of a photo change alike. It decides for a
-/// channel that is clipped at white.
+/// Weight, in matches, of the prior that all channels of a photo differ from other photos by the
+/// same number of stops. It matters for a channel that is clipped at white.
 const CHANNEL_PRIOR_WEIGHT: f32 = 1.0;
 
 fn median(values: &mut [f32]) -> Option<f32> {
@@ -62,7 +62,7 @@ pub fn compare(colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Brightness {
     let looks = apparent_stops(colors);
     // A photo may look bright only because it shows bright surfaces. Apparent brightness is
     // therefore scaled by the least-squares slope of measured against apparent brightness.
-    let measured = consistent(&channels, &DVector::zeros(looks.len()));
+    let measured = solve_stops(&channels, &DVector::zeros(looks.len()));
     let measured_indices = channels.iter().enumerate().flat_map(|(c, all)| {
         all.iter()
             .flat_map(move |d| [d.0, d.1].map(|photo| 3 * photo + c))
@@ -71,7 +71,7 @@ pub fn compare(colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Brightness {
     let [common, own] = tied_channels.iter().fold([0.0, 0.0], |[common, own], &k| {
         [common + measured[k] * looks[k], own + looks[k] * looks[k]]
     });
-    let stops = consistent(
+    let stops = solve_stops(
         &channels,
         &(looks * (common / own.max(f32::MIN_POSITIVE)).clamp(0.0, 1.0)),
     );
@@ -108,11 +108,11 @@ fn apparent_stops(colors: &[Vec<[u8; 3]>]) -> DVector<f32> {
 }
 
 /// Returns the stops of each photo's channels, `[photo][3]`, that fit all differences best (least
-/// squares). Each channel has a mean of 0. Without differences, `apparent_stops` decides.
-fn consistent(channels: &[Vec<Difference>; 3], looks: &DVector<f32>) -> DVector<f32> {
+/// squares). Each channel has a mean of 0. Photos without differences get their apparent stops.
+fn solve_stops(channels: &[Vec<Difference>; 3], looks: &DVector<f32>) -> DVector<f32> {
     let mut normal = DMatrix::<f32>::identity(looks.len(), looks.len()) * APPEARANCE_PRIOR_WEIGHT;
     let mut right = looks * APPEARANCE_PRIOR_WEIGHT;
-    let mut differs = |a: usize, b: usize, stops: f32, weight: f32| {
+    let mut add_difference = |a: usize, b: usize, stops: f32, weight: f32| {
         (normal[(a, a)], normal[(b, b)]) = (normal[(a, a)] + weight, normal[(b, b)] + weight);
         (normal[(a, b)], normal[(b, a)]) = (normal[(a, b)] - weight, normal[(b, a)] - weight);
         (right[a], right[b]) = (right[a] + weight * stops, right[b] - weight * stops);
@@ -120,12 +120,12 @@ fn consistent(channels: &[Vec<Difference>; 3], looks: &DVector<f32>) -> DVector<
     for (c, differences) in channels.iter().enumerate() {
         differences
             .iter()
-            .for_each(|&(a, b, stops, weight)| differs(3 * a + c, 3 * b + c, stops, weight));
+            .for_each(|&(a, b, stops, weight)| add_difference(3 * a + c, 3 * b + c, stops, weight));
     }
     for red in (0..looks.len()).step_by(3) {
         [(0, 1), (1, 2), (2, 0)]
             .into_iter()
-            .for_each(|(a, b)| differs(red + a, red + b, 0.0, CHANNEL_PRIOR_WEIGHT));
+            .for_each(|(a, b)| add_difference(red + a, red + b, 0.0, CHANNEL_PRIOR_WEIGHT));
     }
     let mut stops = normal.cholesky().map_or_else(
         || DVector::zeros(looks.len()),
@@ -195,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn a_channel_that_is_cut_off_follows_the_others() {
+    fn a_clipped_channel_follows_the_others() {
         // Red is clipped in the second photo, so only green and blue measure its brightness.
         let gains = gains_of(&[[1.0; 3], [9.0, 2.0, 2.0], [1.0; 3], [1.0; 3]]);
         let stops = [0, 1, 2].map(|c| (gains[1][c] / gains[0][c]).log2());
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn a_photo_that_nothing_matches_is_as_bright_as_it_looks_where_light_varies() {
+    fn unmatched_photo_gets_its_apparent_brightness_if_light_varies() {
         let stops = |light: [f32; 5]| {
             let gains = gains_of(&light.map(|gain| [gain; 3]));
             (gains[4][1] / gains[0][1]).log2()

@@ -10,9 +10,9 @@ use std::collections::BTreeSet;
 
 /// Number of random samples of three cameras each (RANSAC).
 const TRIALS: usize = 2000;
-/// Largest distance of equal positions, as a share of the cameras' `spread`.
+/// Largest distance of positions that count as equal, as a share of the cameras' `spread`.
 const MAX_DISTANCE: f32 = 0.02;
-/// Largest angle of equal rotations, in radians.
+/// Largest angle between rotations that count as equal, in radians.
 const MAX_ANGLE: f32 = 0.05;
 /// Number of times that the frame is fitted again to all cameras that agree with it.
 const FITS: usize = 3;
@@ -120,7 +120,7 @@ mod tests {
     use glam::Mat3;
 
     #[test]
-    fn the_frame_is_that_of_the_poses_that_were_right() {
+    fn align_finds_the_frame_of_the_correct_poses() {
         let eye = |k: usize, angle: f32| {
             let (sin, cos) = (0.3 * k as f32 + angle).sin_cos();
             Camera::look_at(

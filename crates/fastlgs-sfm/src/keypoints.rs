@@ -95,8 +95,8 @@ fn detect_in_rust(photo: &GrayImage) -> Result<Keypoints> {
             "it returned different numbers of key points and descriptors".to_owned(),
         ));
     }
-    // SIFT counts from the centre of the first pixel of a doubled picture, which lies 0.25 pixels
-    // from the photo's corner.
+    // SIFT doubles the picture first. Its origin is the centre of the first doubled pixel, 0.25
+    // photo pixels from the photo's corner.
     let positions = found
         .keypoints
         .iter()
@@ -212,7 +212,7 @@ mod tests {
 
     /// Key points lie on their blobs on average: a bias of half a pixel would rotate every camera.
     #[test]
-    fn key_points_lie_where_blobs_are() {
+    fn key_points_are_centred_on_blobs() {
         // Each range of radii belongs to one octave, so that a shifted octave shows as a bias.
         const RADII: [f32; 3] = [1.5, 3.0, 6.0];
         const BLOBS: usize = 40;

@@ -1,9 +1,9 @@
 //! Structure from motion of FastLGS: from photos or a video to poses, tracks and depth.
 //!
-//! [`keypoints`] and [`matching`] find correspondences, [`tracks`] and [`triangulate`] make points
-//! of them. [`structure`] computes missing poses; [`bundle`], [`resection`], [`pose_check`] and
-//! [`pose_convention`] refine and check given ones. [`sweep`] estimates depth, [`brightness`] how
-//! bright each photo is, and [`video`] selects frames.
+//! [`keypoints`] and [`matching`] find correspondences; [`tracks`] and [`triangulate`] compute
+//! points from them. [`structure`] computes missing poses. [`bundle`], [`resection`],
+//! [`pose_check`] and [`pose_convention`] refine and check given poses. [`sweep`] estimates depth,
+//! and [`brightness`] the brightness of each photo. [`video`] selects frames.
 
 pub mod brightness;
 pub mod bundle;
@@ -35,7 +35,8 @@ pub enum Error {
         "the photos have no poses, and no program that computes poses is installed: run 'fastlgs models install-offline', which installs pycolmap, or install COLMAP ('apt-get install colmap'), or provide poses with the photos"
     )]
     NoPoseProgram,
-    /// Only the program COLMAP is installed, which cannot use lenses of its own for each photo.
+    /// Only the program COLMAP is installed. Poses for given lenses, one for each photo, need
+    /// pycolmap.
     #[error(
         "this needs pycolmap, but only the program 'colmap' is installed; run 'fastlgs models install-offline' to install pycolmap"
     )]
@@ -45,9 +46,9 @@ pub enum Error {
     PoseProgram {
         /// Path or name of the program.
         program: String,
-        /// What it computed.
+        /// Stage that failed.
         stage: String,
-        /// Its last words, or the reason of the operating system.
+        /// Its last line of output, or the error of the operating system.
         reason: String,
     },
     /// Too few photos to compute poses.
@@ -60,7 +61,7 @@ pub enum Error {
         /// Files that were not read, each after "; ".
         notes: String,
     },
-    /// No photo of the folder could be placed.
+    /// COLMAP computed no pose for any photo of the folder.
     #[error("{}: COLMAP could place no photo; check that the photos are sharp and that neighbouring photos overlap", .0.display())]
     NoPoses(PathBuf),
     /// The callback cancelled the search for poses.
@@ -74,7 +75,7 @@ pub enum Error {
     UnreadableVideo {
         /// File of the video.
         video: PathBuf,
-        /// The last words of ffmpeg.
+        /// Last line of ffmpeg's error output.
         reason: String,
     },
     /// A video in which the camera hardly moves.

@@ -231,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn blocks_find_what_the_definition_does() {
+    fn blocked_matching_equals_brute_force() {
         let mut rng = Rng::new(3, "descriptors");
         for (n, m) in [(0, 5), (1, 1), (7, 9), (130, 121)] {
             let a: Vec<[u8; 128]> = (0..n)
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn poses_tell_what_repeats_apart() {
+    fn epipolar_lines_disambiguate_repeated_patterns() {
         // Two photos whose key points are shifted along the rows. The pattern repeats from row to
         // row, so it is matched only with known poses.
         let mut rng = Rng::new(4, "rows");

@@ -5,7 +5,7 @@ use image::{GrayImage, RgbImage};
 
 /// A photo is blurred if its sharpness, relative to the median, is below this value.
 const BLURRED: f32 = 0.2;
-/// Smallest weight of a photo.
+/// Smallest weight of a photo's masks, see [`weights`].
 const MIN_WEIGHT: f32 = 0.1;
 /// Mean difference of grey values, 0 to 255, below which two thumbnails count as the same photo.
 const SAME: f32 = 1.0;
@@ -22,8 +22,8 @@ pub struct PhotoStats {
 }
 
 impl PhotoStats {
-    /// Measures a photo. Division by the variance keeps plain and dark photos from counting as
-    /// blurred.
+    /// Measures a photo. The division by the variance prevents plain and dark photos from being
+    /// classified as blurred.
     pub fn of(photo: &RgbImage) -> Self {
         Self::of_gray(&grayscale(photo))
     }
@@ -69,7 +69,8 @@ pub fn blurred(photos: &[PhotoStats]) -> Vec<usize> {
         .collect()
 }
 
-/// Returns the weight of each photo: its relative sharpness, from `MIN_WEIGHT` to 1.
+/// Returns the weight that the masks of each photo have when objects are found: the relative
+/// sharpness of the photo, from `MIN_WEIGHT` to 1.
 pub fn weights(photos: &[PhotoStats]) -> Vec<f32> {
     relative(photos)
         .map(|sharpness| sharpness.clamp(MIN_WEIGHT, 1.0))

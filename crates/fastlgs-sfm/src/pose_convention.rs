@@ -19,7 +19,7 @@ const MIN_MATCHES: usize = 20;
 const TOLERANCE: f32 = 0.01;
 /// Smallest share of inliers with which another convention is accepted.
 const MIN_INLIER_SHARE: f32 = 0.5;
-/// Factor by which its share of inliers must exceed that of every other convention.
+/// Factor by which the accepted convention's share of inliers must exceed that of every other.
 const MIN_RATIO: f32 = 1.5;
 
 /// Matches a sample of the key points of photos that are one or two apart in the order of names.
@@ -76,7 +76,7 @@ pub fn sample(keypoints: &[Keypoints]) -> Vec<PairMatches> {
 
 /// Distance of two cameras below which they count as one position, as a share of their distance
 /// from the origin.
-const ONE_PLACE: f32 = 1e-5;
+const SAME_POSITION: f32 = 1e-5;
 
 /// Returns the share of matches that are inliers of the epipolar geometry of these cameras; `None`
 /// without matches.
@@ -89,7 +89,7 @@ pub fn inlier_share(
     let obeying = |pair: &PairMatches| {
         let (a, b) = (&cameras[pair.a], &cameras[pair.b]);
         let [at_a, at_b] = [a.centre(), b.centre()];
-        if at_a.distance(at_b) <= ONE_PLACE * at_a.length().max(at_b.length()) {
+        if at_a.distance(at_b) <= SAME_POSITION * at_a.length().max(at_b.length()) {
             // Without a baseline there are no epipolar lines.
             return 0;
         }
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn the_convention_that_poses_are_written_in_is_found() {
+    fn pose_convention_is_detected() {
         let mut rng = Rng::new(3, "convention");
         let cloud = ring::cloud(&mut rng);
         // As if hand-held: cameras do not look exactly at the centre.
@@ -222,7 +222,7 @@ mod tests {
         let keypoints: Vec<Keypoints> = cameras
             .iter()
             .map(|c| {
-                ring::seen(c, &cloud, || {
+                ring::key_points(c, &cloud, || {
                     Vec2::new(rng.range(-0.5, 0.5), rng.range(-0.5, 0.5))
                 })
             })

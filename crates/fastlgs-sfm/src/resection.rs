@@ -19,11 +19,12 @@ const STEPS: usize = 12;
 /// Smallest number and smallest share of points that must agree on a pose. Repeated texture can
 /// make a quarter of them agree on a wrong pose.
 const MIN_POINTS: usize = 25;
-const LEAST_SHARE: f32 = 0.3;
+const MIN_SHARE: f32 = 0.3;
 
-/// Computes the poses of `lost` photos from points of the other photos, and returns the photos it
-/// placed.
-/// The photo with the most agreeing points comes first; its points then help to place the next.
+/// Computes the poses of `lost` photos, whose poses are unknown or wrong, from points of the other
+/// photos. Returns the photos that it placed, in that order.
+///
+/// The photo with the most agreeing points is placed first; its points then help to place the next.
 /// `matches` must include those of lost photos, unfiltered by poses.
 pub fn place(
     cameras: &mut [Camera],
@@ -64,12 +65,12 @@ fn known_points(
         .iter()
         .filter(|m| !lost.contains(&m.a) && !lost.contains(&m.b));
     let obeying: Vec<PairMatches> = good
-        .map(|m| m.obeying(cameras, keypoints, TOLERANCE))
+        .map(|m| m.inliers(cameras, keypoints, TOLERANCE))
         .collect();
     let tracks = tracks(cameras, keypoints, &obeying, TOLERANCE);
     tracks
         .iter()
-        .flat_map(|track| track.seen.iter().map(|seen| (*seen, track.position)))
+        .flat_map(|track| track.key_points.iter().map(|seen| (*seen, track.position)))
         .collect()
 }
 
@@ -110,7 +111,7 @@ fn place_one(
     let found = starts
         .map(|start| refine_pose(start, &seen))
         .max_by_key(|found| found.1)?;
-    let enough = found.1 >= MIN_POINTS && found.1 as f32 >= LEAST_SHARE * seen.len() as f32;
+    let enough = found.1 >= MIN_POINTS && found.1 as f32 >= MIN_SHARE * seen.len() as f32;
     tracing::debug!(
         photo = camera.name,
         points = seen.len(),
@@ -125,9 +126,9 @@ fn place_one(
 /// Returns the camera and the number of points within twice `TOLERANCE`.
 fn refine_pose(mut camera: Camera, seen: &[(Vec2, Vec3)]) -> (Camera, usize) {
     let side = f64::from(camera.width.max(camera.height));
-    for soft in LOSS_SCALES.map(|share| share * side) {
+    for loss_scale in LOSS_SCALES.map(|share| share * side) {
         for _ in 0..STEPS {
-            let Some(motion) = step(&camera, seen, soft) else {
+            let Some(motion) = step(&camera, seen, loss_scale) else {
                 break;
             };
             let turn = Quat::from_scaled_axis(Vec3::new(
@@ -149,7 +150,7 @@ fn refine_pose(mut camera: Camera, seen: &[(Vec2, Vec3)]) -> (Camera, usize) {
 
 /// Returns one Gauss-Newton step in camera space: rotation vector, then translation. Returns `None`
 /// if the system cannot be solved.
-fn step(camera: &Camera, seen: &[(Vec2, Vec3)], soft: f64) -> Option<SVector<f64, 6>> {
+fn step(camera: &Camera, seen: &[(Vec2, Vec3)], loss_scale: f64) -> Option<SVector<f64, 6>> {
     let pose = camera.world_to_camera.as_dmat4();
     let (rotation, translation) = (DMat3::from_mat4(pose), pose.w_axis.truncate());
     let focal = DVec2::new(camera.fx.into(), camera.fy.into());
@@ -165,7 +166,7 @@ fn step(camera: &Camera, seen: &[(Vec2, Vec3)], soft: f64) -> Option<SVector<f64
         let ray = q.truncate() / q.z;
         let residual =
             focal * ray + DVec2::new(camera.cx.into(), camera.cy.into()) - pixel.as_dvec2();
-        let weight = 1.0 / (1.0 + residual.length_squared() / (soft * soft));
+        let weight = 1.0 / (1.0 + residual.length_squared() / (loss_scale * loss_scale));
         for (row, r) in [
             (focal.x / q.z * DVec3::new(1.0, 0.0, -ray.x), residual.x),
             (focal.y / q.z * DVec3::new(0.0, 1.0, -ray.y), residual.y),
@@ -189,7 +190,7 @@ mod tests {
     use fastlgs_core::rng::Rng;
 
     #[test]
-    fn photos_with_poses_from_nowhere_are_placed() {
+    fn photos_with_arbitrary_poses_are_placed() {
         let mut rng = Rng::new(5, "ring");
         let (cloud, truth) = (ring::cloud(&mut rng), ring::cameras(10));
         // 40 % of the key points are displaced.
@@ -199,7 +200,7 @@ mod tests {
         };
         let keypoints: Vec<Keypoints> = truth
             .iter()
-            .map(|c| ring::seen(c, &cloud, &mut error))
+            .map(|c| ring::key_points(c, &cloud, &mut error))
             .collect();
         let pairs = (0..10).flat_map(|a| (a + 1..10).map(move |b| (a, b)));
         let matches: Vec<PairMatches> = pairs

@@ -40,7 +40,7 @@ pub fn cameras(count: usize) -> Vec<Camera> {
 }
 
 /// Returns the key points of a camera, each displaced by `error()` pixels.
-pub fn seen(camera: &Camera, cloud: &[Point], mut error: impl FnMut() -> Vec2) -> Keypoints {
+pub fn key_points(camera: &Camera, cloud: &[Point], mut error: impl FnMut() -> Vec2) -> Keypoints {
     let pixel = |p: &Point| camera.to_pixel(camera.world_to_camera.transform_point3(p.0)) + error();
     Keypoints {
         positions: cloud.iter().map(pixel).collect(),

@@ -117,12 +117,13 @@ pub fn photos_in(images: &Path) -> Result<Vec<PathBuf>> {
 }
 
 /// Computes the poses of the photos of one folder. Returns the folder of the largest COLMAP model.
-/// The result lies in the folder `work`, which is emptied first. `progress` receives the stage and the
-/// latest output of the tool, at least once a second. It returns whether to continue.
+///
+/// The result lies in the folder `work`, which is emptied first. `progress` receives the stage and
+/// the latest output of the tool, at least once a second. It returns whether to continue.
 ///
 /// # Errors
-/// The tool fails, no photo could be placed, or `progress` cancelled the work. The message contains the
-/// last output of the tool.
+/// The tool fails, no photo could be placed, or `progress` cancelled the work. The message contains
+/// the last output of the tool.
 pub fn reconstruct(
     tool: &Tool,
     files: &[PathBuf],
@@ -140,7 +141,7 @@ pub fn reconstruct(
     match tool {
         Tool::Colmap(program) => by_program(program, images, work, &models, files, &progress)?,
         Tool::Pycolmap(python) => {
-            plan(files, work, seed, &progress)?;
+            prepare_input(files, work, seed, &progress)?;
             by_script(python, work, &progress)?;
         }
     }
@@ -148,13 +149,13 @@ pub fn reconstruct(
 }
 
 /// Runs pycolmap on the input files in the work folder.
-fn by_script(python: &Path, work: &Path, say: &impl Fn(&str, &str) -> bool) -> Result<()> {
+fn by_script(python: &Path, work: &Path, progress: &impl Fn(&str, &str) -> bool) -> Result<()> {
     let script = work.join("reconstruct.py");
     std::fs::write(&script, RECONSTRUCT).map_err(fastlgs_core::Error::io(&script))?;
     run(
         Command::new(python).arg(&script).arg(work),
         "structure from motion",
-        say,
+        progress,
     )
 }
 
@@ -165,7 +166,7 @@ fn by_program(
     work: &Path,
     models: &Path,
     files: &[PathBuf],
-    say: &impl Fn(&str, &str) -> bool,
+    progress: &impl Fn(&str, &str) -> bool,
 ) -> Result<()> {
     let matcher = if files.len() <= EXHAUSTIVE {
         "exhaustive_matcher"
@@ -216,7 +217,7 @@ fn by_program(
         if let Some(option) = known_option(program, name, &USE_GPU) {
             command.args([option, "0"]);
         }
-        run(command.args(options), stage, say)?;
+        run(command.args(options), stage, progress)?;
     }
     Ok(())
 }
@@ -242,14 +243,14 @@ fn known_option(program: &Path, stage: &str, options: &[&'static str]) -> Option
 
 /// Finds and matches key points, and writes the input files of `reconstruct.py` into the work
 /// folder.
-fn plan(
+fn prepare_input(
     files: &[PathBuf],
     work: &Path,
     seed: u64,
-    say: &(impl Fn(&str, &str) -> bool + Sync),
+    progress: &(impl Fn(&str, &str) -> bool + Sync),
 ) -> Result<()> {
     let found = |path: &PathBuf| -> Result<(u32, u32, Keypoints)> {
-        check_cancelled(say(
+        check_cancelled(progress(
             "features",
             &path.file_name().unwrap_or_default().to_string_lossy(),
         ))?;
@@ -262,7 +263,7 @@ fn plan(
     };
     let photos = files.par_iter().map(found).collect::<Result<Vec<_>>>()?;
     let points: Vec<&Keypoints> = photos.iter().map(|p| &p.2).collect();
-    let pairs = matched(&points, say)?;
+    let pairs = matched(&points, progress)?;
     let name = |path: &PathBuf| {
         path.file_name()
             .unwrap_or_default()
@@ -321,12 +322,12 @@ pub fn reconstruct_with_lenses(
     points: &[Keypoints],
     work: &Path,
     seed: u64,
-    say: impl Fn(&str, &str) -> bool + Sync,
+    progress: impl Fn(&str, &str) -> bool + Sync,
 ) -> Result<Vec<Option<Mat4>>> {
     let _ = std::fs::remove_dir_all(work);
     std::fs::create_dir_all(work).map_err(fastlgs_core::Error::io(work))?;
     let points: Vec<&Keypoints> = points.iter().collect();
-    let pairs = matched(&points, &say)?;
+    let pairs = matched(&points, &progress)?;
     let image = |((path, camera), points): ((&PathBuf, &Camera), &Keypoints)| {
         let path = std::path::absolute(path).unwrap_or_else(|_| path.clone());
         json!({
@@ -341,7 +342,7 @@ pub fn reconstruct_with_lenses(
         .map(image)
         .collect();
     write_plan(work, images, &points, &pairs, seed)?;
-    by_script(python, work, &say)?;
+    by_script(python, work, &progress)?;
     // Rows of [R t] per photo, from the model with the most photos.
     let rows: Vec<Option<[[f32; 4]; 3]>> = fs::read_json(&work.join("poses.json"))?;
     let pose = |[x, y, z]: [[f32; 4]; 3]| {
@@ -362,10 +363,10 @@ pub fn reconstruct_with_lenses(
 /// Matches the key points of photo pairs. Pairs with fewer than `MIN_MATCHES` matches are left out.
 fn matched(
     points: &[&Keypoints],
-    say: &(impl Fn(&str, &str) -> bool + Sync),
+    progress: &(impl Fn(&str, &str) -> bool + Sync),
 ) -> Result<Vec<PairMatches>> {
     let of_pair = |(a, b): (usize, usize)| {
-        check_cancelled(say("matches", ""))?;
+        check_cancelled(progress("matches", ""))?;
         Ok(PairMatches {
             a,
             b,
@@ -420,22 +421,26 @@ fn largest_model(models: &Path) -> Option<PathBuf> {
 }
 
 /// Returns an error if the callback cancelled the search for poses.
-fn check_cancelled(on: bool) -> Result<()> {
-    if on { Ok(()) } else { Err(Error::Cancelled) }
+fn check_cancelled(continues: bool) -> Result<()> {
+    if continues {
+        Ok(())
+    } else {
+        Err(Error::Cancelled)
+    }
 }
 
 /// Longest time between two calls of `progress` while a tool prints nothing.
-const SILENT: Duration = Duration::from_secs(1);
+const PROGRESS_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Runs one stage and passes its output to `progress`.
-fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str) -> bool) -> Result<()> {
+fn run(command: &mut Command, stage: &str, progress: &impl Fn(&str, &str) -> bool) -> Result<()> {
     let program = command.get_program().to_string_lossy().into_owned();
     let failed = |reason| Error::PoseProgram {
         program: program.clone(),
         stage: stage.to_owned(),
         reason,
     };
-    check_cancelled(say(stage, ""))?;
+    check_cancelled(progress(stage, ""))?;
     // Both streams are read, so that a full pipe does not block the tool.
     let mut child = command
         .stdout(Stdio::piped())
@@ -452,7 +457,7 @@ fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str) -> bool) ->
     }
     let mut last = String::new();
     loop {
-        match printed.recv_timeout(SILENT) {
+        match printed.recv_timeout(PROGRESS_INTERVAL) {
             Ok(line) if line.trim().is_empty() => continue,
             Ok(line) => {
                 tracing::debug!(stage, line, "COLMAP");
@@ -461,18 +466,18 @@ fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str) -> bool) ->
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => break,
         }
-        if !say(stage, last.trim()) {
+        if !progress(stage, last.trim()) {
             let _ = child.kill();
             let _ = child.wait();
             return check_cancelled(false);
         }
     }
     let status = child.wait().map_err(|e| failed(e.to_string()))?;
-    let complaint = errors.and_then(|thread| thread.join().ok().flatten());
+    let last_error_line = errors.and_then(|thread| thread.join().ok().flatten());
     if status.success() {
         Ok(())
     } else {
-        Err(failed(complaint.unwrap_or(last)))
+        Err(failed(last_error_line.unwrap_or(last)))
     }
 }
 
@@ -543,7 +548,7 @@ mod tests {
     }
 
     #[test]
-    fn failures_are_told_in_the_tools_words() {
+    fn errors_contain_the_last_output_of_the_tool() {
         let dir = tempfile::tempdir().unwrap();
         let broken = stand_in(dir.path(), "echo 'cannot open display' >&2; exit 1");
         let error = reconstruct(
@@ -583,7 +588,7 @@ mod tests {
     }
 
     #[test]
-    fn a_silent_tool_ends_when_that_is_asked_for() {
+    fn a_silent_tool_can_be_cancelled() {
         let dir = tempfile::tempdir().unwrap();
         let asleep = stand_in(dir.path(), "[ \"$2\" = --help ] || exec sleep 600");
         let began = std::time::Instant::now();
@@ -592,11 +597,11 @@ mod tests {
             &photos(dir.path(), 4),
             &dir.path().join("work"),
             0,
-            |_, _| began.elapsed() < SILENT,
+            |_, _| began.elapsed() < PROGRESS_INTERVAL,
         )
         .unwrap_err();
         assert!(error.to_string().contains("cancelled"), "{error}");
-        assert!(began.elapsed() < 10 * SILENT);
+        assert!(began.elapsed() < 10 * PROGRESS_INTERVAL);
     }
 
     #[test]

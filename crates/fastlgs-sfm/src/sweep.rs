@@ -1,8 +1,8 @@
 //! Plane sweep stereo: computes initial points from photos with known poses, so that training also
 //! starts with surfaces between key points.
 //!
-//! Depth maps as by Collins 1996, merged as by Schoenberger et al. 2016: a point needs a depth on
-//! which several photos agree.
+//! Depth maps are computed as by Collins 1996 and merged as by Schoenberger et al. 2016: several
+//! photos must agree on the depth of a point.
 
 use crate::tracks::Track;
 use fastlgs_core::dataset::SfmPoint;
@@ -22,7 +22,7 @@ const NEIGHBOURS: usize = 4;
 /// ones most patches look different. Neighbours with the smallest parallax are taken first, so
 /// large angles matter only if photos are few.
 const PARALLAX: [f32; 2] = [2.0, 60.0];
-/// Radius of a patch in pixels; its side is 2 * HALF + 1.
+/// Radius of a patch in pixels; its side is 2 * PATCH_RADIUS + 1.
 const PATCH_RADIUS: usize = 3;
 /// Smallest correlation of an accepted depth.
 const MIN_CORRELATION: f32 = 0.7;
@@ -39,11 +39,11 @@ const MIN_AGREEING_VIEWS: usize = 2;
 const SPACING: usize = 1;
 const SAME_DEPTH: f32 = 0.05;
 /// Smallest number of tracks that determine the depth range of a photo.
-const FEW: usize = 10;
+const MIN_TRACKS: usize = 10;
 /// Share of the nearest and farthest track depths that is ignored, and the factor by which the
 /// remaining range is extended.
 const OUTLIERS: f32 = 0.02;
-const ROOM: f32 = 1.3;
+const RANGE_FACTOR: f32 = 1.3;
 
 /// A swept photo: grey values 0 to 255, colours and camera at reduced size.
 struct View {
@@ -123,7 +123,7 @@ fn bounds(cameras: &[Camera], tracks: &[Track]) -> Vec<Option<[f32; 2]>> {
     let depth = |view: usize, p: Vec3| cameras[view].world_to_camera.transform_point3(p).z;
     for track in tracks {
         track
-            .seen
+            .key_points
             .iter()
             .for_each(|&(view, _)| own[view].push(depth(view, track.position)));
     }
@@ -135,13 +135,16 @@ fn bounds(cameras: &[Camera], tracks: &[Track]) -> Vec<Option<[f32; 2]>> {
             .collect::<Vec<_>>()
     };
     let of = |(view, mut depths): (usize, Vec<f32>)| {
-        if depths.len() < FEW {
+        if depths.len() < MIN_TRACKS {
             depths = all(view);
         }
         depths.sort_by(f32::total_cmp);
         let last = depths.len().checked_sub(1)?;
         let cut = (OUTLIERS * last as f32) as usize;
-        Some([depths[cut] / ROOM, depths[last - cut] * ROOM])
+        Some([
+            depths[cut] / RANGE_FACTOR,
+            depths[last - cut] * RANGE_FACTOR,
+        ])
     };
     own.into_iter().enumerate().map(of).collect()
 }
@@ -165,11 +168,12 @@ fn neighbours(views: &[View], view: usize) -> Vec<usize> {
             .angle_between(other.camera.forward())
             .to_degrees()
     };
-    let telling = |&(_, angle): &(usize, f32)| (PARALLAX[0]..PARALLAX[1]).contains(&angle);
+    let has_usable_parallax =
+        |&(_, angle): &(usize, f32)| (PARALLAX[0]..PARALLAX[1]).contains(&angle);
     let others = (0..views.len()).filter(|&v| v != view && turned(&views[v]) < PARALLAX[1]);
     let mut others: Vec<(usize, f32)> = others
         .map(|v| (v, angle(&views[v])))
-        .filter(telling)
+        .filter(has_usable_parallax)
         .collect();
     others.sort_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
     others.into_iter().take(NEIGHBOURS).map(|o| o.0).collect()
@@ -245,12 +249,12 @@ impl Patches {
         let mut work = Buffers::new(grey.len());
         work.warped.copy_from_slice(grey);
         let (mut mean, mut square) = (vec![0.0; grey.len()], vec![0.0; grey.len()]);
-        boxed(&work.warped, w, h, &mut work.rows, &mut mean);
+        box_mean(&work.warped, w, h, &mut work.rows, &mut mean);
         work.product
             .iter_mut()
             .zip(grey)
             .for_each(|(p, g)| *p = g * g);
-        boxed(&work.product, w, h, &mut work.rows, &mut square);
+        box_mean(&work.product, w, h, &mut work.rows, &mut square);
         let deviation = mean
             .iter()
             .zip(&square)
@@ -326,7 +330,7 @@ fn warp(own: &View, other: &View, depth: f32, out: &mut [f32]) {
 
 vectorised! {
     /// Writes the normalised correlation of each patch of `grey` and `work.warped` into
-    /// `work.score`: 1 if they are equal, -1 if a patch is cut off.
+    /// `work.score`: 1 if they are equal, -1 if a patch extends beyond its image.
     fn correlate(grey: &[f32], patches: &Patches, w: usize, h: usize, work: &mut Buffers) = correlate_body
 }
 
@@ -338,18 +342,18 @@ fn correlate_body<const FMA: bool>(
     h: usize,
     work: &mut Buffers,
 ) {
-    boxed(&work.warped, w, h, &mut work.rows, &mut work.mean);
+    box_mean(&work.warped, w, h, &mut work.rows, &mut work.mean);
     work.product
         .iter_mut()
         .zip(&work.warped)
         .for_each(|(p, v)| *p = v * v);
-    boxed(&work.product, w, h, &mut work.rows, &mut work.square);
+    box_mean(&work.product, w, h, &mut work.rows, &mut work.square);
     work.product
         .iter_mut()
         .zip(&work.warped)
         .zip(grey)
         .for_each(|((p, v), g)| *p = v * g);
-    boxed(&work.product, w, h, &mut work.rows, &mut work.cross);
+    box_mean(&work.product, w, h, &mut work.rows, &mut work.cross);
     for p in 0..w * h {
         let covariance = work.cross[p] - work.mean[p] * patches.mean[p];
         let deviation = (work.square[p] - work.mean[p] * work.mean[p])
@@ -360,9 +364,9 @@ fn correlate_body<const FMA: bool>(
     }
 }
 
-/// Computes the mean over each patch; NaN if the patch is cut off.
+/// Computes the mean over each patch; NaN if the patch extends beyond the image.
 #[inline(always)]
-fn boxed(plane: &[f32], w: usize, h: usize, rows: &mut [f32], out: &mut [f32]) {
+fn box_mean(plane: &[f32], w: usize, h: usize, rows: &mut [f32], out: &mut [f32]) {
     const SIDES: usize = 2 * PATCH_RADIUS + 1;
     const SHARE: f32 = 1.0 / (SIDES * SIDES) as f32;
     rows.fill(f32::NAN);
@@ -398,10 +402,10 @@ fn merged(views: &[View], neighbours: &[Vec<usize>], depths: &[Vec<f32>]) -> Vec
             let point = view.point(pixel, depths[v][pixel]);
             let (mut sum, mut seen_by) = (point, vec![v as u32]);
             for &other in &neighbours[v] {
-                let Some((there, _)) = views[other].camera.pixel_and_depth(point) else {
+                let Some((other_pixel, _)) = views[other].camera.pixel_and_depth(point) else {
                     continue;
                 };
-                let seen = views[other].point(there, depths[other][there]);
+                let seen = views[other].point(other_pixel, depths[other][other_pixel]);
                 let apart = (pixel as isize
                     - view
                         .camera
@@ -411,7 +415,7 @@ fn merged(views: &[View], neighbours: &[Vec<usize>], depths: &[Vec<f32>]) -> Vec
                 // The same pixel, or an adjacent one.
                 let touches =
                     [0, 1, view.width() - 1, view.width(), view.width() + 1].contains(&apart);
-                if depths[other][there] > 0.0 && touches {
+                if depths[other][other_pixel] > 0.0 && touches {
                     sum += seen;
                     seen_by.push(other as u32);
                 }
@@ -486,7 +490,7 @@ mod tests {
             .collect();
         // The tracks only determine the depth range.
         let track = |k: usize| Track {
-            seen: (0..5).map(|v| (v, k)).collect(),
+            key_points: (0..5).map(|v| (v, k)).collect(),
             position: Vec3::new(0.1 * k as f32 - 1.0, 0.0, 0.0),
             error: 0.5,
         };

@@ -48,7 +48,7 @@ pub fn overlapping_pairs(cameras: &[Camera], count: usize) -> Vec<(usize, usize)
 
 impl PairMatches {
     /// Returns the inliers: matches whose epipolar error by the poses is below `tolerance` pixels.
-    pub fn obeying(&self, cameras: &[Camera], keypoints: &[Keypoints], tolerance: f32) -> Self {
+    pub fn inliers(&self, cameras: &[Camera], keypoints: &[Keypoints], tolerance: f32) -> Self {
         let f = fundamental(&cameras[self.a], &cameras[self.b]);
         let error = |i: usize, j: usize| {
             epipolar_error(
@@ -71,7 +71,7 @@ impl PairMatches {
 #[derive(Clone, Debug)]
 pub struct Track {
     /// (photo, key point), at most one per photo.
-    pub seen: Vec<(usize, usize)>,
+    pub key_points: Vec<(usize, usize)>,
     /// World position.
     pub position: Vec3,
     /// Root mean square of the reprojection errors, in pixels.
@@ -132,7 +132,7 @@ pub fn tracks(
             agreeing,
         } = locate(&views, tolerance)?;
         Some(Track {
-            seen: agreeing.into_iter().map(|k| seen[k]).collect(),
+            key_points: agreeing.into_iter().map(|k| seen[k]).collect(),
             position,
             error,
         })
@@ -147,12 +147,18 @@ pub fn tracks(
 /// of each photo's key points.
 pub fn points(tracks: &[Track], colors: &[Vec<[u8; 3]>]) -> Vec<SfmPoint> {
     let color = |track: &Track| {
-        let sum = track.seen.iter().fold([0u32; 3], |sum, &(photo, k)| {
+        let sum = track.key_points.iter().fold([0u32; 3], |sum, &(photo, k)| {
             std::array::from_fn(|c| sum[c] + u32::from(colors[photo][k][c]))
         });
-        sum.map(|s| (s / track.seen.len() as u32) as u8)
+        sum.map(|s| (s / track.key_points.len() as u32) as u8)
     };
-    let seen_by = |track: &Track| track.seen.iter().map(|(photo, _)| *photo as u32).collect();
+    let seen_by = |track: &Track| {
+        track
+            .key_points
+            .iter()
+            .map(|(photo, _)| *photo as u32)
+            .collect()
+    };
     tracks
         .iter()
         .map(|track| SfmPoint {
@@ -188,9 +194,9 @@ mod tests {
     }
 
     #[test]
-    fn a_point_knows_the_photos_of_its_track() {
+    fn points_list_the_photos_of_their_track() {
         let track = Track {
-            seen: vec![(1, 0), (3, 1)],
+            key_points: vec![(1, 0), (3, 1)],
             position: Vec3::ONE,
             error: 0.1,
         };

@@ -5,7 +5,7 @@ use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
 
 /// Smallest angle between the two rays of a triangulated point, in radians.
 const MIN_ANGLE: f32 = 0.02;
-/// Number of pixels of a point whose pairs are tried as start values.
+/// Largest number of pixels of a point from whose pairs start values are computed.
 const MAX_START_PIXELS: usize = 6;
 /// Gauss-Newton steps. Near the solution, two are sufficient.
 const STEPS: usize = 4;
@@ -82,17 +82,17 @@ pub fn locate(seen: &[(&Camera, Vec2)], tolerance: f32) -> Option<Located> {
             else {
                 continue;
             };
-            let (who, square) = agreeing(point);
+            let (inliers, square) = agreeing(point);
             let better = |b: &(Vec3, Vec<usize>, f32)| {
-                who.len() > b.1.len() || who.len() == b.1.len() && square < b.2
+                inliers.len() > b.1.len() || inliers.len() == b.1.len() && square < b.2
             };
             if best.as_ref().is_none_or(better) {
-                best = Some((point, who, square));
+                best = Some((point, inliers, square));
             }
         }
     }
-    let (start, who, _) = best.filter(|b| b.1.len() >= 2)?;
-    let position = least_squares(start, who.iter().map(|&k| seen[k]));
+    let (start, inliers, _) = best.filter(|b| b.1.len() >= 2)?;
+    let position = least_squares(start, inliers.iter().map(|&k| seen[k]));
     let (agreeing, square) = agreeing(position);
     (agreeing.len() >= 2).then(|| Located {
         position,
@@ -110,19 +110,19 @@ fn least_squares<'a>(start: Vec3, seen: impl Iterator<Item = (&'a Camera, Vec2)>
             let pose = camera.world_to_camera.as_dmat4();
             let q = pose.transform_point3(point);
             let (fx, fy) = (f64::from(camera.fx), f64::from(camera.fy));
-            let shown = DVec2::new(
+            let projected = DVec2::new(
                 fx * q.x / q.z + f64::from(camera.cx),
                 fy * q.y / q.z + f64::from(camera.cy),
             );
-            let residual = shown - pixel.as_dvec2();
-            let turned = DMat3::from_mat4(pose).transpose();
+            let residual = projected - pixel.as_dvec2();
+            let camera_to_world = DMat3::from_mat4(pose).transpose();
             for (row, r) in [
                 (
-                    turned * DVec3::new(fx / q.z, 0.0, -fx * q.x / (q.z * q.z)),
+                    camera_to_world * DVec3::new(fx / q.z, 0.0, -fx * q.x / (q.z * q.z)),
                     residual.x,
                 ),
                 (
-                    turned * DVec3::new(0.0, fy / q.z, -fy * q.y / (q.z * q.z)),
+                    camera_to_world * DVec3::new(0.0, fy / q.z, -fy * q.y / (q.z * q.z)),
                     residual.y,
                 ),
             ] {
@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn a_point_of_many_views_is_better_than_one_of_two_and_survives_a_liar() {
+    fn more_views_are_more_accurate_and_an_outlier_is_rejected() {
         let cameras = ring(8);
         let mut rng = Rng::new(2, "noise");
         let (mut of_all, mut of_two) = (0.0, 0.0);

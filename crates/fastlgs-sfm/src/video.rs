@@ -47,7 +47,9 @@ pub fn is_video(path: &Path) -> bool {
 
 /// Writes selected frames of a video as JPEG files into the new folder `images`, in order of time.
 /// Returns their number.
-/// `progress` receives the seconds examined and the number of selected frames; its error stops the work.
+///
+/// `progress` receives the seconds examined and the number of selected frames. Its error stops the
+/// work.
 ///
 /// # Errors
 /// ffmpeg is missing or cannot read the video, or the video has fewer than three different views.
@@ -187,7 +189,7 @@ struct Ffmpeg<'a> {
     video: &'a Path,
     child: Child,
     /// Reads the error output, so that a full pipe does not block ffmpeg. Returns its last line.
-    complaint: JoinHandle<Option<String>>,
+    last_error_line: JoinHandle<Option<String>>,
 }
 
 impl<'a> Ffmpeg<'a> {
@@ -212,7 +214,7 @@ impl<'a> Ffmpeg<'a> {
         Ok(Self {
             video,
             child,
-            complaint,
+            last_error_line: complaint,
         })
     }
 
@@ -223,7 +225,7 @@ impl<'a> Ffmpeg<'a> {
             return Ok(());
         }
         let reason = self
-            .complaint
+            .last_error_line
             .join()
             .ok()
             .flatten()
@@ -238,7 +240,7 @@ impl<'a> Ffmpeg<'a> {
 /// Returns the numbers of the selected frames, counted at `RATE` frames per second.
 fn choose<E: From<Error>>(
     video: &Path,
-    say: impl Fn(f64, usize) -> Result<(), E>,
+    progress: impl Fn(f64, usize) -> Result<(), E>,
 ) -> Result<Vec<u32>, E> {
     let filter = format!(
         "fps={RATE},scale='if(gt(iw,ih),min({SIDE},iw),-2)':'if(gt(iw,ih),-2,min({SIDE},ih))'"
@@ -249,14 +251,14 @@ fn choose<E: From<Error>>(
         &filter,
         &["-f", "image2pipe", "-c:v", "pgm", "-pix_fmt", "gray", "-"],
     )?;
-    let mut chooser = Chooser::default();
+    let mut chooser = FrameSelector::default();
     let mut look = |stream| -> Result<(), E> {
         let mut stream = BufReader::new(stream);
         let mut number = 0;
         while let Some(frame) = pgm(&mut stream) {
-            chooser.see(number, frame)?;
+            chooser.add_frame(number, frame)?;
             number += 1;
-            say(f64::from(number) / f64::from(RATE), chooser.chosen.len())?;
+            progress(f64::from(number) / f64::from(RATE), chooser.chosen.len())?;
         }
         Ok(chooser.end()?)
     };
@@ -313,7 +315,7 @@ struct Candidate {
 
 /// Selects frames from a stream.
 #[derive(Default)]
-struct Chooser {
+struct FrameSelector {
     /// The latest frames (number, sharpness, pixels). The sharpest one becomes a candidate.
     window: Vec<(u32, f32, GrayImage)>,
     /// Sharpness of recent candidates.
@@ -330,8 +332,8 @@ struct Chooser {
     chosen: Vec<u32>,
 }
 
-impl Chooser {
-    fn see(&mut self, number: u32, frame: GrayImage) -> Result<()> {
+impl FrameSelector {
+    fn add_frame(&mut self, number: u32, frame: GrayImage) -> Result<()> {
         self.window
             .push((number, PhotoStats::of_gray(&frame).sharpness, frame));
         if self.window.len() == WINDOW {
@@ -462,7 +464,7 @@ mod tests {
     }
 
     #[test]
-    fn pixels_become_square_and_hdr_looks_like_photos() {
+    fn non_square_pixels_and_hdr_are_converted() {
         let dir = tempfile::tempdir().unwrap();
         let at = |name: &str| dir.path().join(name);
         let wide = at("wide.mkv");
@@ -522,7 +524,7 @@ mod tests {
     }
 
     #[test]
-    fn neighbours_share_two_thirds_and_blurred_frames_are_passed_over() {
+    fn selected_frames_overlap_and_are_sharp() {
         let wall = wall(900, 160);
         // The camera moves along the wall by two pixels per frame and shows 240 of its pixels. It
         // pauses once, and its frames are blurred for a while.
@@ -534,11 +536,11 @@ mod tests {
             }
         };
         let shaken = |frame: u32| (40..55).contains(&frame);
-        let mut chooser = Chooser::default();
+        let mut chooser = FrameSelector::default();
         for frame in 0..300 {
             let sharp = imageops::crop_imm(&wall, at(frame), 0, 240, 160).to_image();
             chooser
-                .see(
+                .add_frame(
                     frame,
                     if shaken(frame) {
                         imageops::blur(&sharp, 3.0)

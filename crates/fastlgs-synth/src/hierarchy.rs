@@ -104,7 +104,7 @@ mod tests {
     use glam::Mat3;
 
     #[test]
-    fn the_tree_finds_what_asking_everyone_finds() {
+    fn the_tree_and_a_linear_search_find_the_same_hit() {
         let mut rng = Rng::new(1, "hierarchy");
         let mut point =
             |reach: f32| Vec3::from_array(std::array::from_fn(|_| rng.range(-reach, reach)));
@@ -115,7 +115,7 @@ mod tests {
                 half: point(0.3).abs() + 0.05,
                 rotation: Mat3::from_rotation_y(k as f32),
                 surface: Surface::plain(Vec3::ONE),
-                thing: k as u16 + 1,
+                object: k as u16 + 1,
             })
             .collect();
         let tree = Hierarchy::new(&solids);

@@ -232,7 +232,7 @@ enum Material {
 
 /// Builds a world object by object.
 struct Builder {
-    things: Vec<SceneObject>,
+    objects: Vec<SceneObject>,
     solids: Vec<Solid>,
     rng: Rng,
 }
@@ -247,7 +247,7 @@ struct Place {
 impl Builder {
     fn new(seed: u64) -> Self {
         Self {
-            things: Vec::new(),
+            objects: Vec::new(),
             solids: Vec::new(),
             rng: Rng::new(seed, "synth things"),
         }
@@ -255,15 +255,15 @@ impl Builder {
 
     /// Returns the id of the object with a name and parent. Creates the object if it does not
     /// exist.
-    fn thing(&mut self, name: &str, parent: u16) -> u16 {
+    fn object_id(&mut self, name: &str, parent: u16) -> u16 {
         let thing = SceneObject {
             name: name.to_owned(),
             parent,
         };
-        let known = self.things.iter().position(|t| *t == thing);
+        let known = self.objects.iter().position(|t| *t == thing);
         let place = known.unwrap_or_else(|| {
-            self.things.push(thing);
-            self.things.len() - 1
+            self.objects.push(thing);
+            self.objects.len() - 1
         });
         place as u16 + 1
     }
@@ -277,12 +277,12 @@ impl Builder {
         place: &Place,
         parts: bool,
     ) {
-        let whole = self.thing(name, 0);
+        let whole = self.object_id(name, 0);
         let to_world = Mat3::from_rotation_y(place.yaw);
         for piece in pieces {
             let path = if parts { piece.part.as_slice() } else { &[] };
             let thing = path.iter().fold(whole, |parent, part| {
-                self.thing(&format!("{name}'s {part}"), parent)
+                self.object_id(&format!("{name}'s {part}"), parent)
             });
             let own = Mat3::from_rotation_z(piece.tilt[0]) * Mat3::from_rotation_x(piece.tilt[1]);
             let surface = match (piece.look, material) {
@@ -304,7 +304,7 @@ impl Builder {
                 half: place.scale * piece.half,
                 rotation: (to_world * own).transpose(),
                 surface,
-                thing,
+                object: thing,
             });
         }
     }
@@ -319,9 +319,9 @@ impl Builder {
                 colors: [Vec3::new(0.4, 0.25, 0.13), Vec3::new(0.66, 0.45, 0.26)],
                 grain: 6.0,
             },
-            thing,
+            object: thing,
         };
-        let table = self.thing("wooden table", 0);
+        let table = self.object_id("wooden table", 0);
         self.solids.push(slab(
             Vec3::Y * (TABLE_HEIGHT - 0.04),
             Vec3::new(1.35, 0.04, 1.35),
@@ -568,7 +568,7 @@ impl Builder {
             half: CORE,
             rotation: Mat3::IDENTITY,
             surface: walls,
-            thing: 0,
+            object: 0,
         });
         for k in 0..24 {
             let ((name, make), (color_name, color)) =
@@ -618,7 +618,7 @@ impl Builder {
     fn finish(self, cameras: Vec<Camera>, exposures: Vec<Vec3>, backdrop: Backdrop) -> World {
         World {
             tree: Hierarchy::new(&self.solids),
-            objects: self.things,
+            objects: self.objects,
             cameras,
             exposures,
             solids: self.solids,
@@ -649,14 +649,14 @@ fn room(pictures: &Path, views: usize, size: (u32, u32), seed: u64) -> Result<Wo
         let half = Vec3::new(height * aspect.min(1.3), height, height * aspect.min(1.3));
         let centre = Vec3::new(1.15 * angle.cos(), half.y, 1.15 * angle.sin());
         let turn = Mat3::from_rotation_y(rng.range(-0.6, 0.6) - angle);
-        let thing = build.thing(name, 0);
+        let thing = build.object_id(name, 0);
         build.solids.push(Solid {
             shape: Shape::Block,
             centre,
             half,
             rotation: turn,
             surface: Surface::Picture(picture),
-            thing,
+            object: thing,
         });
     }
     let [floor, walls] = TEXTURES;
@@ -693,7 +693,7 @@ mod tests {
 
     /// Nearly every object is visible in some view, and names are unique.
     #[test]
-    fn kinds_show_what_they_name() {
+    fn nearly_all_objects_are_visible_and_names_are_unique() {
         for (name, kind, _) in KINDS.into_iter().filter(|k| k.1 != Kind::Room) {
             let views = if kind == Kind::Long { 40 } else { 6 };
             let size = if kind == Kind::Big {

@@ -126,7 +126,7 @@ impl World {
             return false;
         };
         self.solids
-            .retain(|solid| !containing_ids(&self.objects, solid.thing).any(|id| id == number));
+            .retain(|solid| !containing_ids(&self.objects, solid.object).any(|id| id == number));
         self.tree = Hierarchy::new(&self.solids);
         true
     }
@@ -136,7 +136,7 @@ impl World {
         let there = |number: u16| {
             self.solids
                 .iter()
-                .any(|solid| containing_ids(&self.objects, solid.thing).any(|id| id == number))
+                .any(|solid| containing_ids(&self.objects, solid.object).any(|id| id == number))
         };
         (1..)
             .zip(&self.objects)
@@ -171,7 +171,7 @@ impl World {
             surface => surface.color(hit.local, point, hit.normal) * light(hit.normal),
         };
         Hit {
-            thing: solid.thing,
+            thing: solid.object,
             t: hit.t,
             color,
         }
@@ -214,7 +214,7 @@ impl Backdrop {
             half: self.half_extents,
             rotation: Mat3::IDENTITY,
             surface: self.walls.clone(),
-            thing: 0,
+            object: 0,
         };
         let Some([_, exit]) = inside.crossings(origin, direction) else {
             return Hit {
@@ -287,7 +287,7 @@ mod tests {
             half: Vec3::new(2.0, 1.0, 0.1),
             rotation: Mat3::IDENTITY,
             surface,
-            thing: 1,
+            object: 1,
         };
         let red = Surface::Grain {
             colors: [Vec3::X; 2],
@@ -299,7 +299,7 @@ mod tests {
             half: Vec3::splat(0.5),
             rotation: Mat3::IDENTITY,
             surface: red,
-            thing: 2,
+            object: 2,
         };
         let grey = || Surface::Grain {
             colors: [Vec3::splat(0.5); 2],

@@ -49,6 +49,7 @@ pub const CATALOGUE: [(&str, BuildFn); 12] = [
     ("hat", hat),
 ];
 
+/// Creates a piece that belongs directly to its object. `half` holds the half extents.
 pub fn piece(shape: Shape, centre: [f32; 3], half: [f32; 3], look: Look) -> Piece {
     Piece {
         part: Vec::new(),
@@ -76,7 +77,9 @@ impl Piece {
     }
 }
 
+/// The object's own colour.
 pub const OWN: Look = Look::Own(1.0);
+/// A darker shade of the object's own colour.
 pub const DARKER: Look = Look::Own(0.55);
 pub const BRASS: Look = Look::Fixed(Vec3::new(0.75, 0.6, 0.25));
 pub const WOOD: Look = Look::Fixed(Vec3::new(0.5, 0.33, 0.18));

@@ -30,7 +30,7 @@ pub struct Solid {
     /// Appearance.
     pub surface: Surface,
     /// Id of the object that it belongs to; 0 for the background.
-    pub thing: u16,
+    pub object: u16,
 }
 
 /// A point where a ray crosses the surface of a solid.
@@ -197,12 +197,12 @@ mod tests {
             half: Vec3::new(0.5, 1.0, 2.0),
             rotation: Mat3::IDENTITY,
             surface,
-            thing: 1,
+            object: 1,
         }
     }
 
     #[test]
-    fn rays_cross_where_geometry_says() {
+    fn crossings_have_the_exact_distances() {
         // A ray along x through the centre: the half extent is 0.5. A cone has half its radius
         // there.
         for (shape, reach) in [

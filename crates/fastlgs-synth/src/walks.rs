@@ -6,10 +6,15 @@ use std::f32::consts::TAU;
 
 /// Cameras on a circle whose height varies as a sine wave. All look at one point.
 pub struct Ring {
+    /// Radius of the circle in metres.
     pub radius: f32,
+    /// Mean height of the cameras in metres.
     pub height: f32,
+    /// Amplitude of the height in metres; the wave has three periods per turn.
     pub wave: f32,
+    /// Point that all cameras look at.
     pub target: Vec3,
+    /// Vertical field of view in radians.
     pub fov: f32,
 }
 

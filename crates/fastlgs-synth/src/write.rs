@@ -15,8 +15,9 @@ pub enum Masks {
     Lists,
 }
 
-/// An object is labelled in a view if its area there is at least 1/SLIVER of its largest area in
-/// any view. Smaller slivers, often one pixel wide, would not be outlined by a person.
+/// An object is labelled in a view if its area there is at least 1/`MIN_AREA_DIVISOR` of its
+/// largest area in any view. A person would not outline smaller slivers, which are often one pixel
+/// wide.
 const MIN_AREA_DIVISOR: usize = 100;
 
 /// File with the names of the objects. It is written first and marks a folder of generated photos.
@@ -172,12 +173,12 @@ fn areas(things: &[SceneObject], instances: &LabelMap) -> Vec<usize> {
     areas
 }
 
-/// Returns for each object whether its area is a sliver: less than 1/SLIVER of `max_areas`, its largest
-/// area in any view.
-fn slivers(areas: &[usize], most: &[usize]) -> Vec<bool> {
+/// Returns for each object whether its area is a sliver: less than 1/`MIN_AREA_DIVISOR` of its
+/// largest area in any view (`max_areas`).
+fn slivers(areas: &[usize], max_areas: &[usize]) -> Vec<bool> {
     areas
         .iter()
-        .zip(most)
+        .zip(max_areas)
         .map(|(area, most)| MIN_AREA_DIVISOR * area < *most)
         .collect()
 }
@@ -227,7 +228,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn levels_go_from_wholes_to_parts() {
+    fn levels_and_areas_follow_the_part_tree() {
         let thing = |name: &str, parent| SceneObject {
             name: name.to_owned(),
             parent,

@@ -9,11 +9,12 @@ use crate::encoder::normalise;
 use fastlgs_core::rng::Rng;
 
 /// Number of appearance values at the end of an embedding. A random projection preserves inner
-/// products: 64 values recognise 91 % of an object's other views, all logits 96 %.
+/// products approximately. With 64 values, 91 % of an object's other views are recognised; with all
+/// logits, 96 %.
 pub const COUNT: usize = 64;
 
-/// Mean projection of 3,086 masks of three scenes. Subtracting it removes what all cut-outs share.
-/// It belongs to the axes of `Appearance::new`.
+/// Mean projection of 3,086 masks of three scenes. Subtracting it removes what all crops have in
+/// common. It must be measured again if the axes of `Appearance::new` change.
 const MEAN: [f32; COUNT] = [
     -2.2, 24.2, -18.5, -5.7, -3.5, 28.2, 37.6, -2.6, 18.4, 14.4, 6.7, -39.7, -7.8, 3.9, 35.8, 34.5,
     -6.3, -49.0, -14.6, 9.1, -3.4, -19.4, -16.1, -17.6, -11.8, 32.5, -31.7, 0.3, 3.4, -13.7, -27.3,
@@ -74,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn logits_that_differ_in_nothing_but_their_level_are_alike() {
+    fn appearance_ignores_a_constant_offset_of_logits() {
         let appearance = Appearance::new(1000);
         let mut rng = Rng::new(3, "logits");
         let mut logits = || -> Vec<f32> { (0..1000).map(|_| 3.0 * rng.normal()).collect() };
@@ -91,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_is_of_these_axes() {
+    fn mean_was_measured_with_these_axes() {
         let axes = Appearance::new(1000).0;
         let sum: f32 = axes.iter().flatten().sum();
         assert!(
@@ -102,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_for_words_has_no_appearance() {
+    fn without_appearance_zeroes_the_last_values() {
         let whole: Vec<f32> = (1..=COUNT + 3).map(|v| v as f32).collect();
         let worded = without_appearance(whole.clone());
         assert_eq!(

@@ -103,7 +103,7 @@ fn embedding_output(
     };
     let found = model.output(names).or_else(pooled).or_else(only);
     found.map(str::to_owned).ok_or_else(|| {
-        model.refuse(format!(
+        model.error(format!(
             "none of its outputs is an embedding: {}",
             model.outputs.join(", ")
         ))
@@ -123,13 +123,13 @@ impl ClipImage {
         let model = Model::load(path)?;
         let [slot] = &model.inputs[..] else {
             let names: Vec<&str> = model.inputs.iter().map(|i| i.name.as_str()).collect();
-            return Err(model.refuse(format!(
+            return Err(model.error(format!(
                 "it is not an image tower, which has one input; its inputs are {}",
                 names.join(", ")
             )));
         };
         if slot.shape.len() != 4 {
-            return Err(model.refuse(format!(
+            return Err(model.error(format!(
                 "its input '{}' does not take pictures, which have four dimensions",
                 slot.name
             )));
@@ -208,7 +208,7 @@ impl Encoder for ClipImage {
                 .run(vec![(&self.input, input)], &[&self.output])?
                 .remove(0);
             if embeddings.shape.len() != 2 || embeddings.shape[0] != batch.len() {
-                return Err(self.model.refuse(format!("for {} crops it returned embeddings of shape {:?}; expected one row for each crop", batch.len(), embeddings.shape)));
+                return Err(self.model.error(format!("for {} crops it returned embeddings of shape {:?}; expected one row for each crop", batch.len(), embeddings.shape)));
             }
             dimension = embeddings.shape[1];
             for (label, row) in batch.iter().zip(embeddings.values.chunks_exact(dimension)) {
@@ -235,7 +235,7 @@ impl ClipText {
             .input(&["input_ids", "text", "tokens", "input"])
             .map(|s| (s.name.clone(), s.shape.last().copied().flatten()));
         let (ids, context) =
-            ids.ok_or_else(|| model.refuse("it is no text tower: it has no input for token ids"))?;
+            ids.ok_or_else(|| model.error("it is no text tower: it has no input for token ids"))?;
         let mask = model.input(&["attention_mask"]).map(|s| s.name.clone());
         let configuration = settings(path, "config.json")?;
         let output = embedding_output(&model, &TEXT_OUTPUTS, &configuration)?;
@@ -243,9 +243,9 @@ impl ClipText {
             .as_u64()
             .map(|longest| longest as usize);
         let tokens = if is_siglip(&configuration) {
-            Tokens::of_siglip(path)?
+            Tokens::load_siglip(path)?
         } else {
-            Tokens::beside(path)?
+            Tokens::load_clip(path)?
         };
         Ok(Self {
             context: context.or(configured_context).unwrap_or(tokens.context()),
@@ -278,7 +278,7 @@ impl ClipText {
             }
             let embeddings = self.model.run(inputs, &[&self.output])?.remove(0);
             if embeddings.shape.len() != 2 || embeddings.shape[0] != batch.len() {
-                return Err(self.model.refuse(format!("for {} texts it returned embeddings of shape {:?}; expected one row for each text", batch.len(), embeddings.shape)));
+                return Err(self.model.error(format!("for {} texts it returned embeddings of shape {:?}; expected one row for each text", batch.len(), embeddings.shape)));
             }
             out.extend(
                 embeddings
@@ -351,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn crops_and_texts_meet_in_one_space() {
+    fn crops_are_nearest_to_their_texts() {
         let dir = tempfile::tempdir().unwrap();
         let (image, text) = (dir.path().join("image.onnx"), dir.path().join("text.onnx"));
         toy_models::clip(&image, &text, 32);
@@ -398,7 +398,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pooled_output_is_an_embedding_where_it_is_siglips() {
+    fn pooler_output_is_used_only_for_siglip() {
         let dir = tempfile::tempdir().unwrap();
         let image = dir.path().join("vision_model.onnx");
         toy_models::image_tower(&image, 16, &["last_hidden_state", "pooler_output"]);
@@ -438,7 +438,7 @@ mod tests {
     }
 
     #[test]
-    fn the_wrong_tower_is_refused_by_name() {
+    fn errors_for_the_wrong_tower_name_its_file() {
         let dir = tempfile::tempdir().unwrap();
         let (image, text) = (dir.path().join("image.onnx"), dir.path().join("text.onnx"));
         toy_models::clip(&image, &text, 32);

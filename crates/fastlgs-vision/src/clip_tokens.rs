@@ -1,7 +1,7 @@
 //! Tokenizers of CLIP (byte-pair encoding) and SigLIP.
 //!
-//! CLIP's is read from the `tokenizer.json` beside a model, or built from the merges that OpenAI
-//! published. SigLIP's is read from `tokenizer.json`.
+//! CLIP's tokenizer is read from the `tokenizer.json` beside a model, or built from the merges that
+//! OpenAI published. SigLIP's tokenizer is always read from `tokenizer.json`.
 
 use crate::{Error, Result, model_paths};
 use fastlgs_core::fs;
@@ -41,7 +41,7 @@ impl Tokens {
     ///
     /// # Errors
     /// Both files are missing, or the one that is used is damaged.
-    pub fn beside(model: &Path) -> Result<Self> {
+    pub fn load_clip(model: &Path) -> Result<Self> {
         match tokenizer_path(model) {
             Some(path) => Self::of_clip(
                 Tokenizer::from_file(&path).map_err(|e| damaged(&path, e))?,
@@ -58,7 +58,7 @@ impl Tokens {
     ///
     /// # Errors
     /// The file is missing or damaged.
-    pub fn of_siglip(model: &Path) -> Result<Self> {
+    pub fn load_siglip(model: &Path) -> Result<Self> {
         let missing = || {
             Error::Missing(format!(
                 "{}: SigLIP needs a tokenizer.json in the folder of the model or the one above",
@@ -304,11 +304,11 @@ mod tests {
     }
 
     #[test]
-    fn siglips_rules_are_in_its_file() {
+    fn siglip_tokens_and_padding_come_from_its_files() {
         let dir = tempfile::tempdir().unwrap();
         let model = dir.path().join("onnx").join("text_model.onnx");
         assert!(
-            Tokens::of_siglip(&model)
+            Tokens::load_siglip(&model)
                 .err()
                 .unwrap()
                 .to_string()
@@ -332,7 +332,7 @@ mod tests {
         };
         write(&description);
         // The vocabulary has a token "<pad>" that is not the padding token.
-        let tokens = Tokens::of_siglip(&model).unwrap();
+        let tokens = Tokens::load_siglip(&model).unwrap();
         assert_eq!(
             (
                 tokens.encode(" Red fox", 64).unwrap(),
@@ -351,12 +351,12 @@ mod tests {
             r#"{"pad_token": {"content": "fox"}}"#,
         )
         .unwrap();
-        assert_eq!(Tokens::of_siglip(&model).unwrap().padding(false), 3);
+        assert_eq!(Tokens::load_siglip(&model).unwrap().padding(false), 3);
         description["padding"] = json!({
             "strategy": { "Fixed": 64 }, "direction": "Right", "pad_to_multiple_of": null, "pad_id": 7, "pad_type_id": 0, "pad_token": "<x>",
         });
         write(&description);
-        let tokens = Tokens::of_siglip(&model).unwrap();
+        let tokens = Tokens::load_siglip(&model).unwrap();
         assert_eq!(
             (tokens.encode("fox", 64).unwrap(), tokens.padding(false)),
             (vec![3, 1], 7),

@@ -21,7 +21,9 @@ pub enum Surround {
 }
 
 /// Cuts the box of `label`, widened to a square with a margin. Scales it to `size` pixels: each
-/// pixel is the mean of up to 4 x 4 samples.
+/// pixel is the mean of up to 4 x 4 samples. Pixels outside of the photo are mid grey.
+///
+/// `bounds` is the box of `label`: left, top, right and bottom in pixels of `masks`.
 pub fn crop(
     photo: &RgbImage,
     masks: &LabelMap,
@@ -109,7 +111,7 @@ impl Background {
 const BLUR_SIDE: u32 = 12;
 
 /// Cuts the box of `label` with the given background, and scales it as CLIP's preprocessing does:
-/// bicubic, antialiased.
+/// bicubic, antialiased. `bounds` is the box of `label`, as in [`crop`].
 pub fn bicubic(
     photo: &RgbImage,
     masks: &LabelMap,

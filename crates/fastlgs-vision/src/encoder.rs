@@ -9,8 +9,8 @@ pub trait Encoder: Sync {
     /// Name recorded in the scene; a query must use the text tower of the same encoder.
     fn name(&self) -> &'static str;
     /// Returns one embedding for each label 1..=max of a view's label map, in order; zeros for
-    /// labels that do not occur. The values that are compared with texts have length 1. Further
-    /// values may count between examples ([`crate::appearance`]).
+    /// labels that do not occur. The values that are compared with texts have length 1. Values that
+    /// are compared only with other masks may follow ([`crate::appearance`]).
     ///
     /// # Errors
     /// When inference fails, or imported embeddings are missing.
@@ -28,7 +28,7 @@ pub trait TextEncoder: Send {
 
     /// Returns by how much this text raises the cosine of unrelated masks, compared with other
     /// texts.
-    fn advantage(&self, _text: &str) -> f32 {
+    fn baseline_shift(&self, _text: &str) -> f32 {
         0.0
     }
 }

@@ -11,8 +11,8 @@ pub const BINS: usize = BINS_PER_CHANNEL * BINS_PER_CHANNEL * BINS_PER_CHANNEL;
 /// Returns the normalised joint RGB histogram of each label 1..=max.
 ///
 /// Each pixel is shared linearly between the two nearest bins of each channel. With hard bins, a
-/// small change of brightness would move most pixels to other bins. Algorithm 1 would then require
-/// a cosine above 1.
+/// small change of brightness would move most pixels to other bins. The similarity of colours would
+/// then be so small that Algorithm 1 could match no masks, whatever their embeddings.
 pub fn histograms(photo: &RgbImage, masks: &LabelMap) -> Vec<Vec<f32>> {
     let photo = image::imageops::resize(photo, masks.width, masks.height, FilterType::Triangle);
     let mut out = vec![vec![0.0f32; BINS]; usize::from(masks.max())];
@@ -50,7 +50,7 @@ mod tests {
     use image::Rgb;
 
     #[test]
-    fn a_little_more_light_changes_little() {
+    fn small_brightness_changes_keep_histograms_similar() {
         let masks = LabelMap {
             width: 2,
             height: 1,

@@ -69,12 +69,12 @@ fn stem(view: &str) -> &str {
 
 /// Masks as they are on disk, with the row of each mask's embedding. Masks of finer levels have no
 /// row.
-struct Found {
+struct LoadedMasks {
     list: MaskList,
     rows: Vec<Option<usize>>,
 }
 
-impl Found {
+impl LoadedMasks {
     /// Collects the masks of label maps, from coarse to fine. Embeddings follow the labels of the
     /// coarsest map, from 1 on.
     fn of_maps(maps: &[LabelMap]) -> Self {
@@ -160,7 +160,7 @@ impl Import {
         })
     }
 
-    /// Loads the masks of a view from its own annotation file, or from one of several photos.
+    /// Loads the masks of a view from its own annotation file, or from a file for several photos.
     fn annotated(&self, view: &str) -> Result<MaskList> {
         let sides = self
             .lenses
@@ -204,14 +204,14 @@ impl Import {
     }
 
     /// Loads the masks of a view as they are on disk.
-    fn found(&self, view: &str) -> Result<Found> {
+    fn load_masks(&self, view: &str) -> Result<LoadedMasks> {
         let stem = stem(view);
         let named = |folder: PathBuf, ending: &str| {
             [view, stem].map(|n| folder.join(format!("{n}.{ending}")))
         };
         let masks = self.photos.join("masks");
         match self.layout {
-            Layout::Annotations => self.annotated(view).map(Found::in_order),
+            Layout::Annotations => self.annotated(view).map(LoadedMasks::in_order),
             Layout::Labels => {
                 let whole = self.find(
                     view,
@@ -230,9 +230,9 @@ impl Import {
                 let empty = || Ok(LabelMap::new(whole.width, whole.height));
                 let [part, subpart] = finer
                     .map(|path| path.map_or_else(empty, |path| LabelMap::load_with_void(&path)));
-                Ok(Found::of_maps(&[whole.clone(), part?, subpart?]))
+                Ok(LoadedMasks::of_maps(&[whole.clone(), part?, subpart?]))
             }
-            Layout::MaskFolders => Ok(Found::in_order(pictures(
+            Layout::MaskFolders => Ok(LoadedMasks::in_order(pictures(
                 &self.find(view, &[masks.join(stem), masks.join(view)])?,
             )?)),
             Layout::LangSplat => {
@@ -256,16 +256,16 @@ impl Import {
                     }
                 };
                 Ok(if levels == 1 {
-                    Found::of_maps(&[level(0)])
+                    LoadedMasks::of_maps(&[level(0)])
                 } else {
-                    Found::of_maps(&[3, 2, 1].map(level))
+                    LoadedMasks::of_maps(&[3, 2, 1].map(level))
                 })
             }
             Layout::GaussianGrouping => {
                 let map = LabelMap::load_with_void(
                     &self.find(view, &named(self.photos.join("object_mask"), "png"))?,
                 )?;
-                let mut found = Found::of_maps(&[map]);
+                let mut found = LoadedMasks::of_maps(&[map]);
                 // Rows of embeddings follow the labels, and a label is the same object in all
                 // photos.
                 found
@@ -287,7 +287,7 @@ impl Import {
                     .iter()
                     .map(|inside| u16::from(*inside))
                     .collect();
-                Ok(Found::of_maps(&[LabelMap {
+                Ok(LoadedMasks::of_maps(&[LabelMap {
                     width: mask.width,
                     height: mask.height,
                     labels,
@@ -298,11 +298,11 @@ impl Import {
 
     /// Returns the masks of a view at the size of the prepared photo, without lens distortion.
     /// Masks that become empty are removed.
-    fn fitted(&self, view: &str, width: u32, height: u32) -> Result<Found> {
-        let Found { list, rows } = self.found(view)?;
+    fn load_prepared(&self, view: &str, width: u32, height: u32) -> Result<LoadedMasks> {
+        let LoadedMasks { list, rows } = self.load_masks(view)?;
         if list.masks.is_empty() {
             tracing::warn!("the photo '{view}' has no masks");
-            return Ok(Found::in_order(MaskList::new(width, height)));
+            return Ok(LoadedMasks::in_order(MaskList::new(width, height)));
         }
         let proportions = |w: u32, h: u32| f64::from(w) / f64::from(h);
         if (proportions(list.width, list.height) / proportions(width, height) - 1.0).abs()
@@ -319,7 +319,7 @@ impl Import {
             .get(view)
             .filter(|(_, distortion)| !distortion.is_none());
         if (list.width, list.height) == (width, height) && lens.is_none() {
-            return Ok(Found { list, rows });
+            return Ok(LoadedMasks { list, rows });
         }
         let fit = |map: LabelMap| {
             let map = map.resized(width, height);
@@ -335,7 +335,7 @@ impl Import {
             .zip(rows)
             .filter_map(|(mask, row)| Some((mask?, row)))
             .unzip();
-        Ok(Found {
+        Ok(LoadedMasks {
             list: MaskList {
                 masks,
                 ..MaskList::new(width, height)
@@ -456,7 +456,9 @@ impl Segmenter for Import {
     }
 
     fn segment(&self, view: &str, photo: &RgbImage) -> Result<MaskList> {
-        Ok(self.fitted(view, photo.width(), photo.height())?.list)
+        Ok(self
+            .load_prepared(view, photo.width(), photo.height())?
+            .list)
     }
 }
 
@@ -475,10 +477,10 @@ impl Encoder for Import {
         };
         let embeddings = self.rows(view)?.ok_or_else(missing)?;
         let dimension = embeddings.shape[1];
-        let Found { list, rows } = self.fitted(view, photo.width(), photo.height())?;
+        let LoadedMasks { list, rows } = self.load_prepared(view, photo.width(), photo.height())?;
         // Count the masks on disk: undistorting may have removed some.
         let needed = self
-            .found(view)?
+            .load_masks(view)?
             .rows
             .iter()
             .flatten()

@@ -1,4 +1,4 @@
-//! Inpainters: fill parts of pictures that no photo shows with colours.
+//! Inpainters: compute colours for the parts of pictures that no photo shows.
 
 use crate::runtime::{Array, Model};
 use crate::{Error, Result};
@@ -59,7 +59,7 @@ impl Learned {
             || model.input(&["mask"]).is_none()
             || model.inputs.len() != 2
         {
-            return Err(model.refuse("it is not an inpainter: its inputs must be 'image' [1][3][h][w] and 'mask' [1][1][h][w], as in LaMa's exports"));
+            return Err(model.error("it is not an inpainter: its inputs must be 'image' [1][3][h][w] and 'mask' [1][1][h][w], as in LaMa's exports"));
         }
         Ok(Self(model))
     }
@@ -91,7 +91,7 @@ impl Inpainter for Learned {
             .run(vec![("image", image), ("mask", mask)], &[&output])?
             .remove(0);
         if found.shape != shape(3) {
-            return Err(self.0.refuse(format!(
+            return Err(self.0.error(format!(
                 "it returned a picture of shape {:?} instead of {:?}",
                 found.shape,
                 shape(3)

@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn specks_go_and_bays_stay() {
+    fn small_islands_and_holes_are_removed() {
         let with = mask(&["#####..#", "#.###...", "####....", "#####..."]);
         let without = with.clone().without_specks(2).unwrap();
         assert_eq!(

@@ -99,7 +99,7 @@ pub fn install_offline(mut report: impl FnMut(&str)) -> Result<()> {
         if let Err(error) = install_poses() {
             let _ = std::fs::remove_dir_all(model_paths::poses_venv());
             report(&format!(
-                "pycolmap is not installed, so photos need poses: {error}"
+                "pycolmap could not be installed; to use photos without poses, install COLMAP: {error}"
             ));
         }
     }
@@ -195,8 +195,8 @@ fn run(command: &mut Command, what: &str) -> Result<()> {
     if output.status.success() {
         return Ok(());
     }
-    let said = String::from_utf8_lossy(&output.stderr);
-    let last = said
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    let last = stderr
         .lines()
         .rev()
         .find(|l| !l.trim().is_empty())

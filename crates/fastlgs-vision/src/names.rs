@@ -52,12 +52,12 @@ pub fn common_words(most: usize) -> Result<Vec<String>> {
         .collect();
     pieces.sort();
     let is_word = |piece: &String| piece.len() > 2 && piece.bytes().all(|b| b.is_ascii_lowercase());
-    let things = lists
+    let class_names = lists
         .into_iter()
         .flat_map(|list| list.into_iter().take(SYNONYMS))
         .map(|name| name.to_lowercase());
     let mut seen = BTreeSet::new();
-    let words = things
+    let words = class_names
         .chain(pieces.into_iter().map(|p| p.1).filter(is_word))
         .filter(|word| seen.insert(word.clone()));
     Ok(words.take(most).collect())

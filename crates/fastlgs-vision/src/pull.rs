@@ -30,7 +30,7 @@ pub enum Role {
 
 /// A pair of models that can be pulled.
 #[derive(Clone, Copy, Debug, serde::Serialize)]
-pub struct Named {
+pub struct ModelPair {
     /// Name by which users select it.
     pub name: &'static str,
     /// Purpose of the pair.
@@ -42,32 +42,32 @@ pub struct Named {
 }
 
 /// All model pairs that can be pulled.
-pub const NAMED: [Named; 5] = [
-    Named {
+pub const MODEL_PAIRS: [ModelPair; 5] = [
+    ModelPair {
         name: "slimsam",
         role: Role::Sam,
         repository: "Xenova/slimsam-77-uniform",
         licence: "Apache-2.0",
     },
-    Named {
+    ModelPair {
         name: "sam-vit-b",
         role: Role::Sam,
         repository: "Xenova/sam-vit-base",
         licence: "Apache-2.0",
     },
-    Named {
+    ModelPair {
         name: "clip-vit-b16",
         role: Role::Clip,
         repository: "Xenova/clip-vit-base-patch16",
         licence: "MIT",
     },
-    Named {
+    ModelPair {
         name: "clip-vit-b32",
         role: Role::Clip,
         repository: "Xenova/clip-vit-base-patch32",
         licence: "MIT",
     },
-    Named {
+    ModelPair {
         name: "clip-vit-l14",
         role: Role::Clip,
         repository: "Xenova/clip-vit-large-patch14",
@@ -75,19 +75,22 @@ pub const NAMED: [Named; 5] = [
     },
 ];
 
-impl Named {
+impl ModelPair {
     /// Returns the model pair of that name.
     ///
     /// # Errors
     /// An unknown name; the message lists all names.
     pub fn find(name: &str) -> Result<Self> {
-        NAMED.into_iter().find(|n| n.name == name).ok_or_else(|| {
-            let known: Vec<&str> = NAMED.iter().map(|n| n.name).collect();
-            Error::Missing(format!(
-                "unknown model '{name}'; the available models are: {}",
-                known.join(", ")
-            ))
-        })
+        MODEL_PAIRS
+            .into_iter()
+            .find(|n| n.name == name)
+            .ok_or_else(|| {
+                let known: Vec<&str> = MODEL_PAIRS.iter().map(|n| n.name).collect();
+                Error::Missing(format!(
+                    "unknown model '{name}'; the available models are: {}",
+                    known.join(", ")
+                ))
+            })
     }
 
     /// Returns the files to pull from the repository, the two models first.
@@ -157,10 +160,10 @@ struct Puller<'a> {
 /// The host cannot be reached, breaks off repeatedly, or sends an unexpected file. Existing files
 /// are kept.
 pub fn pull(
-    model: &Named,
+    model: &ModelPair,
     host: &str,
     folder: &Path,
-    mut say: impl FnMut(&str, u64, Option<u64>),
+    mut progress: impl FnMut(&str, u64, Option<u64>),
 ) -> Result<BTreeMap<String, ModelFile>> {
     let config = Agent::config_builder()
         .timeout_connect(Some(Duration::from_secs(20)))
@@ -195,7 +198,7 @@ pub fn pull(
                 sha256: Some(known.sha256.clone()),
             };
         }
-        let partial = puller.fetch(file, &expected, &mut say)?;
+        let partial = puller.fetch(file, &expected, &mut progress)?;
         let (bytes, sha256) = digest(&partial)?;
         std::fs::rename(&partial, &path).map_err(CoreError::io(&path))?;
         pulled.insert(
@@ -300,8 +303,8 @@ impl Puller<'_> {
             Err(e) if have > 0 => return Ok(Transfer::BrokeOff(e.to_string())),
             Err(e) => return Err(unreachable(url, &e)),
         };
-        let goes_on = answer.status() == 206;
-        let mut done = if goes_on { have } else { 0 };
+        let resumes = answer.status() == 206;
+        let mut done = if resumes { have } else { 0 };
         let length = answer
             .headers()
             .get("content-length")
@@ -310,8 +313,8 @@ impl Puller<'_> {
         let file = OpenOptions::new()
             .create(true)
             .write(true)
-            .append(goes_on)
-            .truncate(!goes_on)
+            .append(resumes)
+            .truncate(!resumes)
             .open(partial);
         let mut file = file.map_err(CoreError::io(partial))?;
         let mut reader = answer.into_body().into_reader();
@@ -496,7 +499,7 @@ mod tests {
     ) -> (Result<BTreeMap<String, ModelFile>>, Vec<String>) {
         let (address, asked) = host(manner);
         let result = pull(
-            &Named::find("slimsam").unwrap(),
+            &ModelPair::find("slimsam").unwrap(),
             &address,
             folder,
             |_, _, _| {},
@@ -506,7 +509,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_pulled_is_whole_and_stays() {
+    fn pulled_files_are_complete_and_not_requested_again() {
         let dir = tempfile::tempdir().unwrap();
         let (pulled, asked) = try_pull(Manner::Good, dir.path());
         assert_eq!((pulled.unwrap().len(), asked.len()), (2, 4));
@@ -524,7 +527,7 @@ mod tests {
     }
 
     #[test]
-    fn transfers_that_break_off_go_on() {
+    fn broken_transfers_are_resumed() {
         let dir = tempfile::tempdir().unwrap();
         let (pulled, asked) = try_pull(Manner::BreaksOff, dir.path());
         assert_eq!(pulled.unwrap().len(), 2);
@@ -553,12 +556,17 @@ mod tests {
             assert!(!dir.path().join("onnx/vision_encoder.onnx").exists());
         }
         let dir = tempfile::tempdir().unwrap();
-        let nowhere = pull(&NAMED[0], "http://127.0.0.1:1", dir.path(), |_, _, _| {})
-            .unwrap_err()
-            .to_string();
+        let nowhere = pull(
+            &MODEL_PAIRS[0],
+            "http://127.0.0.1:1",
+            dir.path(),
+            |_, _, _| {},
+        )
+        .unwrap_err()
+        .to_string();
         assert!(nowhere.contains("cannot be reached"), "{nowhere}");
         assert!(
-            Named::find("sam9")
+            ModelPair::find("sam9")
                 .unwrap_err()
                 .to_string()
                 .contains("slimsam")

@@ -109,11 +109,11 @@ fn compare_masks(folder: &Path) {
     };
     let ours = generation::masks(&exports, &photo, &config).unwrap().0;
     let (pixels, shape) = numbers(&folder.join("masks.npy"));
-    let (told, _) = numbers(&folder.join("told.npy"));
+    let (their_scores, _) = numbers(&folder.join("told.npy"));
     let (w, h) = (shape[2], shape[1]);
     let theirs: Vec<(BitMask, f32, f32)> = pixels
         .chunks_exact(w * h)
-        .zip(told.chunks_exact(2))
+        .zip(their_scores.chunks_exact(2))
         .map(|(p, t)| {
             (
                 BitMask::from_fn([0, 0, w as u32, h as u32], |x, y| {

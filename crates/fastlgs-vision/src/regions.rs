@@ -100,8 +100,8 @@ struct Border {
 }
 
 impl Hierarchy {
-    /// Merges adjacent basins until none are left to merge. `features` holds `dimension` values per
-    /// pixel.
+    /// Merges adjacent regions, in ascending order of dissimilarity, until none are adjacent.
+    /// `features` holds `dimension` values per pixel.
     ///
     /// `dissimilarity(edge, a, b)` receives the mean edge strength on the common border, and both
     /// nodes. It must not be negative.
@@ -215,8 +215,8 @@ impl Hierarchy {
     }
 
     /// Returns the nodes of at least `least` pixels, in descending order of area.
-    /// Of nested nodes whose area ratio is above `max_overlap`, only the one with the longest span of
-    /// dissimilarity is kept.
+    /// Of nested nodes whose area ratio is above `max_overlap`, only the one with the longest span
+    /// of dissimilarity is kept: the difference between the heights of its parent and its own.
     pub fn stable_nodes(&self, least: f32, max_overlap: f32) -> Vec<usize> {
         let area = |i: usize| self.nodes[i].area;
         let span = |i: usize| {

@@ -101,9 +101,9 @@ impl Model {
     fn with_sessions(path: &Path, count: usize, threads: usize) -> Result<Self> {
         let name = path.display().to_string();
         if !path.is_file() {
-            let mend = "run 'fastlgs models install-offline' for the offline models, or 'fastlgs models pull NAME' for the others";
+            let hint = "run 'fastlgs models install-offline' for the offline models, or 'fastlgs models pull NAME' for the others";
             return Err(Error::Missing(format!(
-                "{name}: model file not found; {mend}"
+                "{name}: model file not found; {hint}"
             )));
         }
         let failed = |e: &dyn std::fmt::Display| Error::Inference {
@@ -171,7 +171,7 @@ impl Model {
     }
 
     /// Returns an error that names this model and the reason.
-    pub fn refuse(&self, reason: impl Into<String>) -> Error {
+    pub fn error(&self, reason: impl Into<String>) -> Error {
         Error::Inference {
             model: self.name.clone(),
             reason: reason.into(),
@@ -184,12 +184,12 @@ impl Model {
     /// # Errors
     /// An unknown name, an unsupported type, or an error of ONNX Runtime.
     pub fn run(&self, inputs: Vec<(&str, Array)>, outputs: &[&str]) -> Result<Vec<Array>> {
-        let failed = |e: ort::Error| self.refuse(e.to_string());
+        let failed = |e: ort::Error| self.error(e.to_string());
         let mut values = Vec::new();
         for (name, array) in inputs {
             let slot = self
                 .input(&[name])
-                .ok_or_else(|| self.refuse(format!("it has no input '{name}'")))?;
+                .ok_or_else(|| self.error(format!("it has no input '{name}'")))?;
             values.push((name.to_owned(), self.tensor(slot, array)?));
         }
         let free = self
@@ -205,7 +205,7 @@ impl Model {
         let array = |name: &&str| {
             let value = found
                 .get(*name)
-                .ok_or_else(|| self.refuse(format!("it has no output '{name}'")))?;
+                .ok_or_else(|| self.error(format!("it has no output '{name}'")))?;
             let lengths = |shape: &[i64]| shape.iter().map(|d| *d as usize).collect::<Vec<_>>();
             if let Ok((shape, data)) = value.try_extract_tensor::<f16>() {
                 return Ok(Array::new(
@@ -240,12 +240,12 @@ impl Model {
                     .map(Tensor::into_dyn)
             }
             other => {
-                return Err(self.refuse(format!(
+                return Err(self.error(format!(
                     "its input '{}' has the type {other}, which is not supported",
                     slot.name
                 )));
             }
         };
-        value.map_err(|e| self.refuse(e.to_string()))
+        value.map_err(|e| self.error(e.to_string()))
     }
 }

@@ -161,10 +161,10 @@ fn dissimilarity(edge: f32, a: &Node, b: &Node) -> f32 {
         aa += x * x;
         bb += y * y;
     }
-    let meaning = 0.5 - 0.5 * dot / (aa * bb).sqrt();
+    let embedding_distance = 0.5 - 0.5 * dot / (aa * bb).sqrt();
     let small = a.area.min(b.area);
     let small_region_factor = small / (small + 300.0);
-    (0.4 * edge + 0.2 * (color / 40.0).min(1.0) + 0.4 * meaning) * small_region_factor
+    (0.4 * edge + 0.2 * (color / 40.0).min(1.0) + 0.4 * embedding_distance) * small_region_factor
 }
 
 /// Returns the excess of mass of a region: its area times the span of dissimilarity, between `low`

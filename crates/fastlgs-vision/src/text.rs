@@ -66,9 +66,9 @@ impl MiniLm {
 
 impl TextEncoder for MiniLm {
     fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>> {
-        let known = || self.cache.lock().unwrap_or_else(PoisonError::into_inner);
+        let cache = || self.cache.lock().unwrap_or_else(PoisonError::into_inner);
         if let [text] = texts
-            && let Some(embedding) = known().get(*text)
+            && let Some(embedding) = cache().get(*text)
         {
             return Ok(vec![embedding.clone()]);
         }
@@ -99,11 +99,11 @@ impl TextEncoder for MiniLm {
             );
         }
         if let ([text], [embedding]) = (texts, out.as_slice()) {
-            let mut known = known();
-            if known.len() == CACHE_SIZE {
-                known.clear();
+            let mut cache = cache();
+            if cache.len() == CACHE_SIZE {
+                cache.clear();
             }
-            known.insert((*text).to_owned(), embedding.clone());
+            cache.insert((*text).to_owned(), embedding.clone());
         }
         Ok(out)
     }
@@ -152,7 +152,7 @@ impl TextEncoder for OfflineText {
             .collect())
     }
 
-    fn advantage(&self, text: &str) -> f32 {
+    fn baseline_shift(&self, text: &str) -> f32 {
         attributes::baseline_shift(text)
     }
 }
@@ -162,7 +162,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_colour_is_told_by_pixels_and_still_part_of_the_phrase() {
+    fn colour_names_set_attributes_and_stay_in_the_embedding() {
         let text = match OfflineText::load() {
             Ok(text) => text,
             Err(e) if std::env::var_os("FASTLGS_REQUIRE_MODELS").is_some() => panic!("{e}"),

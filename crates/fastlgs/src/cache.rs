@@ -65,7 +65,7 @@ impl Cache {
             .collect();
         let path = self.root.join(stage).join(name);
         // An unreadable file counts as missing.
-        let known = std::fs::read(&path)
+        let cached = std::fs::read(&path)
             .ok()
             .and_then(|bytes| postcard::from_bytes(&bytes).ok());
         self.used
@@ -73,11 +73,11 @@ impl Cache {
             .expect("no panic while holding the lock")
             .insert(path.clone());
         let mut counts = self.counts.lock().expect("no panic while holding the lock");
-        let [there, all] = counts.entry(stage).or_default();
-        *all += 1;
-        *there += usize::from(known.is_some());
+        let [hits, requests] = counts.entry(stage).or_default();
+        *requests += 1;
+        *hits += usize::from(cached.is_some());
         drop(counts);
-        if let Some(known) = known {
+        if let Some(known) = cached {
             return Ok(known);
         }
         let made = make()?;
@@ -94,9 +94,9 @@ impl Cache {
             .clone()
     }
 
-    /// Removes results that this run did not use, oldest first. The rest takes no more bytes than
-    /// the used results, or than [`MIN_UNUSED_BYTES`] if that is more. So a trial with another segmenter keeps
-    /// the earlier results.
+    /// Removes the oldest results that this run did not use. Unused results may take as many bytes
+    /// as used ones, and at least [`MIN_UNUSED_BYTES`]. A trial with another segmenter therefore
+    /// keeps the earlier results.
     pub fn tidy(&self) {
         self.tidy_to(MIN_UNUSED_BYTES);
     }
@@ -114,25 +114,27 @@ impl Cache {
                 .flatten()
         });
         // Other files in these folders are not results.
-        let ours = |file: &std::fs::DirEntry| {
+        let is_result = |file: &std::fs::DirEntry| {
             let name = file.file_name();
             name.len() == NAME_LENGTH && name.as_encoded_bytes().iter().all(u8::is_ascii_hexdigit)
         };
-        let known = files
-            .filter(ours)
+        let results = files
+            .filter(is_result)
             .filter_map(|file| Some((file.path(), file.metadata().ok()?)));
-        let (in_use, mut idle): (Vec<_>, Vec<_>) = known.partition(|(path, _)| used.contains(path));
-        let room = in_use
+        let (in_use, mut unused): (Vec<_>, Vec<_>) =
+            results.partition(|(path, _)| used.contains(path));
+        let max_unused_bytes = in_use
             .iter()
             .map(|(_, about)| about.len())
             .sum::<u64>()
             .max(least);
         // The newest first.
-        idle.sort_by_key(|(path, about)| (std::cmp::Reverse(about.modified().ok()), path.clone()));
+        unused
+            .sort_by_key(|(path, about)| (std::cmp::Reverse(about.modified().ok()), path.clone()));
         let mut taken = 0;
-        for (path, about) in idle {
+        for (path, about) in unused {
             taken += about.len();
-            if taken > room {
+            if taken > max_unused_bytes {
                 let _ = std::fs::remove_file(path);
             }
         }
@@ -144,7 +146,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_what_changed_is_made_again() {
+    fn only_changed_inputs_are_recomputed() {
         let dir = tempfile::tempdir().unwrap();
         let made = std::cell::RefCell::new(0);
         let ask = |cache: &Cache, input: &str| {

@@ -55,7 +55,7 @@ const LEAST_AREA: f32 = 0.0005;
 
 /// A generated scene: its true objects, and their embeddings.
 struct GeneratedScene {
-    things: Vec<SceneObject>,
+    objects_and_parts: Vec<SceneObject>,
     grid: Grid,
 }
 
@@ -64,17 +64,17 @@ struct GeneratedScene {
 ///
 /// # Errors
 /// Towers that cannot be loaded or that distinguish no objects, or a folder that cannot be written.
-pub fn calibrate(eyes: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
+pub fn calibrate(choice: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
     let clock = Instant::now();
-    if eyes.encoder != EncoderKind::Clip {
+    if choice.encoder != EncoderKind::Clip {
         bail!(
             "only CLIP can be calibrated: the offline encoder is calibrated already, and imported embeddings cannot be; choose the towers with --clip, or with --clip-image and --clip-text"
         );
     }
-    let image_tower = eyes.clip_files()?[0].clone();
-    let tower = eyes.clip_image()?;
+    let image_tower = choice.clip_files()?[0].clone();
+    let tower = choice.clip_image()?;
     let encoders = Background::ALL.map(|background| tower.clone().with_background(background));
-    let texts = eyes.text_encoder()?;
+    let texts = choice.text_encoder()?;
     let pictures = models::pictures_dir();
     let mut worlds = TABLES
         .iter()
@@ -83,17 +83,18 @@ pub fn calibrate(eyes: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
     // The room needs pictures that may not be installed; the tables do not.
     worlds.extend(Kind::Room.world(&pictures, VIEWS, SIZE, 0).ok());
     let work = run.work("calibrate", (worlds.len() * VIEWS) as u64);
-    let mut known: Vec<Vec<GeneratedScene>> = Background::ALL.map(|_| Vec::new()).into();
+    let mut scenes_by_background: Vec<Vec<GeneratedScene>> =
+        Background::ALL.map(|_| Vec::new()).into();
     for world in worlds {
         embed_world(&world, &encoders, || work.advance())?
             .into_iter()
-            .zip(&mut known)
+            .zip(&mut scenes_by_background)
             .for_each(|(seen, known)| known.push(seen));
     }
     let canonical = texts.embed(&CANONICAL)?;
     let anything = Calibration::CLIP.anything;
     let query = |text: &str| -> Result<TextQuery> {
-        let anything = anything + texts.advantage(text);
+        let anything = anything + texts.baseline_shift(text);
         Ok(TextQuery {
             canonical: canonical.clone(),
             min_canonical: anything,
@@ -101,20 +102,20 @@ pub fn calibrate(eyes: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
         })
     };
     let is_present = |name: &str| {
-        known[0]
+        scenes_by_background[0]
             .iter()
-            .flat_map(|k| &k.things)
+            .flat_map(|k| &k.objects_and_parts)
             .any(|t| t.name.contains(name))
     };
     let absent = absent_where(is_present);
-    let blind = || {
+    let no_separation = || {
         format!(
             "{}: the encoder cannot distinguish the generated objects by their names; check that it is an image tower of CLIP",
             image_tower.display()
         )
     };
     let (mut calibrations, mut separation) = (BTreeMap::new(), BTreeMap::new());
-    for (background, known) in Background::ALL.into_iter().zip(&known) {
+    for (background, known) in Background::ALL.into_iter().zip(&scenes_by_background) {
         let named = by_names(known, &absent, query)?;
         let texts = Calibration::measured(&named, anything);
         let pictures = Calibration::measured(&by_examples(known), anything);
@@ -128,13 +129,13 @@ pub fn calibrate(eyes: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
         .iter()
         .rev()
         .max_by(|a, b| a.1.total_cmp(b.1))
-        .with_context(blind)?;
+        .with_context(no_separation)?;
     let (background, Calibrations { texts, pictures }) = (*background, calibrations[background]);
     let kept = calibration_path(&image_tower);
     fs::write_json(
         &kept,
         &CalibrationFile {
-            sha256: calibrations::sums(&eyes.files()?),
+            sha256: calibrations::tower_hashes(&choice.files()?),
             background,
             calibrations,
         },
@@ -144,7 +145,10 @@ pub fn calibrate(eyes: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
         separation,
         texts,
         pictures,
-        things: known[0].iter().map(|k| k.things.len()).sum(),
+        things: scenes_by_background[0]
+            .iter()
+            .map(|k| k.objects_and_parts.len())
+            .sum(),
         absent: absent.len(),
         kept,
         seconds: clock.elapsed().as_secs_f64(),
@@ -194,7 +198,7 @@ fn embed_world(
             .zip(&things)
             .for_each(|(object, thing)| object.parent = thing.parent);
         GeneratedScene {
-            things: things.clone(),
+            objects_and_parts: things.clone(),
             grid,
         }
     };
@@ -208,7 +212,7 @@ impl GeneratedScene {
             .grid
             .objects
             .iter()
-            .zip(self.things.iter().map(|t| t.name.as_str()));
+            .zip(self.objects_and_parts.iter().map(|t| t.name.as_str()));
         named.filter(|(object, _)| !object.embeddings.is_empty())
     }
 
@@ -221,8 +225,8 @@ impl GeneratedScene {
     }
 }
 
-/// Returns samples of a labelled scene. `bench names` calibrates each scene by samples of the
-/// others.
+/// Returns samples of a labelled scene. `fastlgs-bench names` calibrates each scene with the
+/// samples of the other scenes.
 ///
 /// # Errors
 /// Labels of views that the scene lacks, or a failing device.
@@ -268,12 +272,11 @@ pub fn samples_of(scene: &mut Scene, views: &[LabelledView]) -> Result<Samples> 
     Ok(samples)
 }
 
-/// Returns the absent names for which `is_present` is false, each by itself and with a colour. The
-/// colour of a present object must not make an absent name match.
-fn absent_where(there: impl Fn(&str) -> bool) -> Vec<String> {
+/// Returns the absent names for which `is_present` is false, each alone and with a colour in front.
+fn absent_where(is_present: impl Fn(&str) -> bool) -> Vec<String> {
     let absent = ABSENT
         .into_iter()
-        .filter(|name| !there(name))
+        .filter(|name| !is_present(name))
         .zip(COLORS.into_iter().cycle());
     absent
         .flat_map(|(name, color)| [name.to_owned(), format!("{color} {name}")])
@@ -300,8 +303,8 @@ fn add_sample<'a>(
     }
 }
 
-/// Returns samples of texts: names of objects, compared with all objects; and absent names,
-/// compared with all scenes.
+/// Returns samples of texts. Names of objects are compared with all objects of their scene, and
+/// absent names with all scenes.
 fn by_names(
     known: &[GeneratedScene],
     absent: &[String],
@@ -328,20 +331,20 @@ fn by_names(
 /// other objects. Absent samples are all views of an object, compared with scenes that lack it.
 fn by_examples<'a>(known: &'a [GeneratedScene]) -> Samples {
     let mut samples = Samples::default();
-    let shown = |object: &Object| {
+    let first_view_query = |object: &Object| {
         TextQuery::of_examples(vec![object.embeddings[0].clone()], Calibration::CLIP)
     };
     // A taught name also keeps all embeddings of its object.
     let all_views_query =
         |object: &Object| TextQuery::of_examples(object.embeddings.clone(), Calibration::CLIP);
-    let several = |scene: &'a GeneratedScene| {
+    let objects_with_many_views = |scene: &'a GeneratedScene| {
         scene
             .objects()
             .filter(|(object, _)| object.embeddings.len() > 1)
     };
     for scene in known {
-        for (object, _) in several(scene) {
-            let query = shown(object);
+        for (object, _) in objects_with_many_views(scene) {
+            let query = first_view_query(object);
             let rest = Object {
                 embeddings: object.embeddings[1..].to_vec(),
                 areas: object.areas[1..].to_vec(),
@@ -351,8 +354,9 @@ fn by_examples<'a>(known: &'a [GeneratedScene]) -> Samples {
         }
     }
     for scene in known {
-        for (object, name) in several(scene) {
-            let lack = |other: &&GeneratedScene| other.things.iter().all(|t| t.name != name);
+        for (object, name) in objects_with_many_views(scene) {
+            let lack =
+                |other: &&GeneratedScene| other.objects_and_parts.iter().all(|t| t.name != name);
             let best = known
                 .iter()
                 .filter(lack)

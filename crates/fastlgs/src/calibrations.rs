@@ -27,14 +27,14 @@ pub struct Calibrations {
 pub(crate) struct CalibrationFile {
     /// SHA-256 of image and text tower.
     pub sha256: [String; 2],
-    /// Background around masks with which names separate objects best.
+    /// Background around masks with which the cosines of names separate the objects best.
     pub background: Background,
     /// Calibrations by background.
     pub calibrations: BTreeMap<Background, Calibrations>,
 }
 
 /// Returns the SHA-256 of image and text tower among model files; empty if one is missing.
-pub(crate) fn sums(files: &BTreeMap<String, ModelFile>) -> [String; 2] {
+pub(crate) fn tower_hashes(files: &BTreeMap<String, ModelFile>) -> [String; 2] {
     ["clip_image", "clip_text"].map(|role| {
         files
             .get(role)
@@ -43,7 +43,8 @@ pub(crate) fn sums(files: &BTreeMap<String, ModelFile>) -> [String; 2] {
     })
 }
 
-/// Reads the calibration file of these towers; `None` if there is none, or none for these hashes.
+/// Reads the calibration file of these towers. Returns `None` if it is missing, unreadable, or for
+/// towers with other hashes.
 fn read_calibration(files: &BTreeMap<String, ModelFile>) -> Option<CalibrationFile> {
     let path = calibration_path(&files.get("clip_image")?.path);
     let kept = path
@@ -56,7 +57,7 @@ fn read_calibration(files: &BTreeMap<String, ModelFile>) -> Option<CalibrationFi
             path.display()
         );
     }
-    kept.ok().filter(|kept| kept.sha256 == sums(files))
+    kept.ok().filter(|kept| kept.sha256 == tower_hashes(files))
 }
 
 /// Returns the background around masks in the crops of a scene.
@@ -74,7 +75,7 @@ pub(crate) fn background_of(manifest: &Manifest) -> Result<Background> {
 }
 
 /// Returns the word for a background in the manifest; empty for grey.
-pub(crate) fn word_of(background: Background) -> String {
+pub(crate) fn background_name(background: Background) -> String {
     match background {
         Background::Grey => String::new(),
         other => serde_json::to_value(other)
@@ -85,7 +86,7 @@ pub(crate) fn word_of(background: Background) -> String {
 }
 
 /// Returns whether a readable calibration file lies beside an image tower.
-pub fn is_measured(image_tower: &Path) -> bool {
+pub fn has_calibration_file(image_tower: &Path) -> bool {
     fs::read_json::<CalibrationFile>(&calibration_path(image_tower)).is_ok()
 }
 

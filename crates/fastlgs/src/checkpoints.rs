@@ -15,9 +15,9 @@ pub(crate) fn can_resume(folder: &SceneFolder) -> bool {
 }
 
 /// Removes all checkpoints.
-pub(crate) fn forget(folder: &SceneFolder) {
+pub(crate) fn remove_all(folder: &SceneFolder) {
     fastlgs_raster::checkpoint::remove(&path(folder));
-    // Mask targets of the views (see `train/borders.rs`).
+    // Mask targets of the views (see `train/mask_supervision.rs`).
     let _ = std::fs::remove_dir_all(folder.root.join("checkpoints/borders"));
     // This fails if other files are in the folder, which then stays.
     let _ = std::fs::remove_dir(folder.root.join("checkpoints"));

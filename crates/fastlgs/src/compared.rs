@@ -3,12 +3,12 @@
 use fastlgs_core::metrics;
 use fastlgs_raster::Target;
 
-/// A render and its photo, both `[3][h][w]`. Pixels of the photo that do not count are copied from
-/// the render.
+/// A render and its photo, both `[3][h][w]`, values 0 to 1. Pixels of the photo that do not count
+/// are copied from the render.
 pub(crate) struct Compared {
     pub rendered: Vec<f32>,
     pub photo: Vec<f32>,
-    /// The pixels that count, `[h][w]`.
+    /// Whether each pixel counts, `[h][w]`. Ignored pixels do not count.
     pub counts: Vec<bool>,
 }
 
@@ -97,7 +97,7 @@ mod tests {
     use glam::Vec3;
 
     #[test]
-    fn exposure_is_fitted_and_what_does_not_count_is_left_out() {
+    fn exposure_is_fitted_and_ignored_pixels_are_left_out() {
         let camera = Camera::look_at("a", Vec3::Z, Vec3::ZERO, Vec3::Y, 8, 4, 0.8);
         let rendered: Vec<f32> = (0..96).map(|k| (k % 32) as f32 / 64.0).collect();
         let shown = |k: usize| ((0.5 * rendered[k] + 0.2) * 255.0) as u8;

@@ -86,7 +86,7 @@ const PRECISION_VIEWS: usize = 4;
 /// PSNR that each group of values may lose in these views, in dB.
 const PRECISION_LOSS: f64 = 0.01;
 
-/// Files and folders of a small folder, besides the manifest.
+/// Files and folders of an earlier small folder that the export replaces, besides the manifest.
 const REPLACED: [&str; 4] = [
     "scene.safetensors",
     "grid.json",
@@ -133,12 +133,12 @@ pub fn export(config: &ExportConfig, run: &Run) -> Result<ExportReport> {
     let mut scene = Scene::open(&config.scene, run.device)?;
     let held_out = scene.manifest().held_out(scene.cameras());
     // Without held-out views, one training view measures the loss.
-    let shown = if held_out.is_empty() {
+    let measured_views = if held_out.is_empty() {
         scene.cameras().iter().take(1).cloned().collect()
     } else {
         held_out.clone()
     };
-    let before = pictures(&mut scene, &shown)?;
+    let before = pictures(&mut scene, &measured_views)?;
     let degree = config
         .sh_degree
         .unwrap_or(scene.gaussians().sh_degree)
@@ -169,7 +169,7 @@ pub fn export(config: &ExportConfig, run: &Run) -> Result<ExportReport> {
         )
     };
     scene.set_gaussians(written)?;
-    let after = pictures(&mut scene, &shown)?;
+    let after = pictures(&mut scene, &measured_views)?;
     // Compare renders with renders: an exported scene may have no photos.
     let same: Vec<f64> = before.iter().zip(&after).map(|(a, b)| psnr(b, a)).collect();
     Ok(ExportReport::Scene(Box::new(SceneReport {
@@ -181,8 +181,8 @@ pub fn export(config: &ExportConfig, run: &Run) -> Result<ExportReport> {
         sh_degree: scene.gaussians().sh_degree,
         bytes_a_value: precision,
         psnr_held_out: BeforeAfter {
-            before: against_photos(&scene, &held_out, &before)?,
-            after: against_photos(&scene, &held_out, &after)?,
+            before: mean_psnr_to_photos(&scene, &held_out, &before)?,
+            after: mean_psnr_to_photos(&scene, &held_out, &after)?,
         },
         psnr_against_original: same.iter().sum::<f64>() / same.len().max(1) as f64,
         adapter: scene.adapter(),
@@ -206,7 +206,11 @@ fn have_photos(scene: &Scene, views: &[Camera]) -> bool {
 
 /// Returns the mean PSNR of renders against photos in dB, over the pixels that count; `None` if
 /// photos are missing.
-fn against_photos(scene: &Scene, views: &[Camera], pictures: &[Vec<f32>]) -> Result<Option<f64>> {
+fn mean_psnr_to_photos(
+    scene: &Scene,
+    views: &[Camera],
+    pictures: &[Vec<f32>],
+) -> Result<Option<f64>> {
     if !have_photos(scene, views) {
         return Ok(None);
     }
@@ -222,8 +226,8 @@ fn against_photos(scene: &Scene, views: &[Camera], pictures: &[Vec<f32>]) -> Res
     Ok((!each.is_empty()).then(|| each.iter().sum::<f64>() / each.len() as f64))
 }
 
-/// Returns the least precision that suffices for some training views; the default if their photos
-/// are missing.
+/// Returns the smallest precision at which no group of values costs more than [`PRECISION_LOSS`] in
+/// a few training views. Returns the default precision if their photos are missing.
 fn precision(scene: &mut Scene) -> Result<Precision> {
     let training = scene.manifest().training(scene.cameras());
     let views: Vec<Camera> = training
@@ -233,13 +237,13 @@ fn precision(scene: &mut Scene) -> Result<Precision> {
         .collect();
     let original = scene.gaussians().clone();
     let before = pictures(scene, &views)?;
-    if against_photos(scene, &views, &before)?.is_none() {
+    if mean_psnr_to_photos(scene, &views, &before)?.is_none() {
         return Ok(Precision::default());
     }
     let chosen = Precision::choose(&original, PRECISION_LOSS, |gaussians| {
         scene.set_gaussians(gaussians.clone())?;
         let pictures = pictures(scene, &views)?;
-        against_photos(scene, &views, &pictures)?
+        mean_psnr_to_photos(scene, &views, &pictures)?
             .context("the photos of the scene are missing now; run 'fastlgs preprocess' again")
     })?;
     scene.set_gaussians(original)?;
@@ -301,6 +305,7 @@ fn small_folder(scene: &mut Scene, root: &Path) -> Result<(Gaussians, Precision)
     Ok((written, precision))
 }
 
+/// Returns the size of a file, or of all files in a scene folder that queries need, in bytes.
 fn bytes_of(path: &Path) -> u64 {
     if path.is_dir() {
         crate::scene::query_file_bytes(path)

@@ -237,7 +237,7 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
                     scenes.first().map(|s| &s.1).filter(|first| model_choice::identity_of(first) != model_choice::identity_of(own)).map(|first| {
                         let [own, first] = [own, first].map(|m| [m.encoder.as_str(), m.crops.as_str()].join(" ").trim_end().to_owned());
                         format!(
-                            "its encoder ('{own}') is not that of the library ('{first}'); preprocess and train it again with that of the library"
+                            "its encoder is '{own}', but the other scenes have '{first}'; preprocess and train it again with the encoder of the other scenes"
                         )
                     })
                 }
@@ -254,6 +254,7 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
     Ok((scenes, skipped))
 }
 
+/// Adds the scene folders in `folder` and in `depth - 1` levels of subfolders to `out`.
 fn collect(folder: &Path, depth: usize, out: &mut Vec<PathBuf>) -> Result<()> {
     let entries = std::fs::read_dir(folder)
         .with_context(|| format!("{}: the library's folder cannot be read", folder.display()))?;

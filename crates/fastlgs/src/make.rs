@@ -71,7 +71,7 @@ pub fn make(config: &MakeConfig, run: &Run) -> Result<MakeReport> {
             .sam_preset
             .get_or_insert(SamPreset::LangSplat);
     }
-    let (state, train) = scene(&preprocess, &train, [run, run])?;
+    let (state, train) = make_scene(&preprocess, &train, [run, run])?;
     let folder = SceneFolder::open(&config.preprocess.output)?;
     let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
     Ok(MakeReport {
@@ -84,12 +84,12 @@ pub fn make(config: &MakeConfig, run: &Run) -> Result<MakeReport> {
     })
 }
 
-/// Makes a scene with all options of both stages; `runs` holds the run of each. `train.scene` must
-/// be `preprocess.output`.
+/// Makes a scene with all options of both stages. `runs` holds the run of `preprocess` and that of
+/// `train`. `train.scene` must be `preprocess.output`.
 ///
 /// # Errors
 /// Those of both stages.
-pub fn scene(
+pub fn make_scene(
     preprocess: &preprocess::PreprocessConfig,
     train: &train::TrainConfig,
     runs: [&Run; 2],
@@ -100,13 +100,13 @@ pub fn scene(
         .with_context(|| format!("{}: the photos cannot be opened", photos.display()))?;
     let seeds = runs.map(|run| run.seed);
     // Leave out the paths of the scene, because a scene may be moved.
-    let how = preprocess::PreprocessConfig {
+    let preprocess_options = preprocess::PreprocessConfig {
         photos: photos.clone(),
         output: PathBuf::new(),
         ..preprocess.clone()
     };
     let how = json!([
-        how,
+        preprocess_options,
         train::TrainConfig {
             scene: PathBuf::new(),
             ..train.clone()
@@ -119,7 +119,7 @@ pub fn scene(
         conse::VERSION,
         seeds,
         how,
-        files(&photos)?
+        fingerprints(&photos)?
     ]);
     // A scene that cannot be read is made again.
     let known = folder.manifest().ok();
@@ -136,17 +136,17 @@ pub fn scene(
         return Ok((State::Kept, report));
     }
     let lock = SceneLock::take(&preprocess.output, "make")?;
-    // An interrupted preprocessing continues by the cache, an interrupted training by its
-    // checkpoint.
-    let begun = known.is_some() && checkpoints::can_resume(&folder);
-    if !begun {
-        checkpoints::forget(&folder);
+    // The cache continues an interrupted preprocessing. The checkpoint continues an interrupted
+    // training.
+    let can_resume = known.is_some() && checkpoints::can_resume(&folder);
+    if !can_resume {
+        checkpoints::remove_all(&folder);
         crate::preprocess::preprocess_locked(preprocess, &lock, runs[0])?;
         record(&folder, &made)?;
     }
     let report = train::train_locked(
         &train::TrainConfig {
-            resume: begun || train.resume,
+            resume: can_resume || train.resume,
             ..train.clone()
         },
         &lock,
@@ -157,7 +157,7 @@ pub fn scene(
     Ok((State::Made, report))
 }
 
-/// Records in the manifest what the scene was made of.
+/// Records in the manifest the photos and options that the scene was made from.
 fn record(folder: &SceneFolder, made: &Value) -> Result<()> {
     let mut manifest = folder.manifest()?;
     let mut notes = SceneNotes::read(&manifest, &folder.root)?;
@@ -168,14 +168,14 @@ fn record(folder: &SceneFolder, made: &Value) -> Result<()> {
 
 /// Returns the fingerprint of a video, or those of all files in a folder by name. Hidden files are
 /// skipped.
-fn files(folder: &Path) -> Result<Value> {
+fn fingerprints(folder: &Path) -> Result<Value> {
     if folder.is_file() {
         return fingerprint(folder);
     }
-    let refused = |error| fastlgs_core::Error::io(folder)(error);
+    let read_error = |error| fastlgs_core::Error::io(folder)(error);
     let mut found = serde_json::Map::new();
-    for entry in std::fs::read_dir(folder).map_err(refused)? {
-        let entry = entry.map_err(refused)?;
+    for entry in std::fs::read_dir(folder).map_err(read_error)? {
+        let entry = entry.map_err(read_error)?;
         let name = entry.file_name().to_string_lossy().into_owned();
         // Follow links, which are common in folders of photos.
         let Some(about) = std::fs::metadata(entry.path())
@@ -185,7 +185,7 @@ fn files(folder: &Path) -> Result<Value> {
             continue;
         };
         let value = if about.is_dir() {
-            files(&entry.path())?
+            fingerprints(&entry.path())?
         } else {
             fingerprint(&entry.path())?
         };
@@ -199,17 +199,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn changed_photos_are_noticed() {
+    fn changed_photos_change_the_fingerprint() {
         let dir = tempfile::tempdir().unwrap();
         let images = dir.path().join("images");
         std::fs::create_dir(&images).unwrap();
         std::fs::write(images.join("a.jpg"), "1").unwrap();
-        let before = files(dir.path()).unwrap();
-        assert_eq!(before, files(dir.path()).unwrap());
+        let before = fingerprints(dir.path()).unwrap();
+        assert_eq!(before, fingerprints(dir.path()).unwrap());
         std::fs::write(images.join("b.jpg"), "1").unwrap();
-        let more = files(dir.path()).unwrap();
+        let more = fingerprints(dir.path()).unwrap();
         assert_ne!(before, more);
         std::fs::write(images.join("b.jpg"), "12").unwrap();
-        assert_ne!(more, files(dir.path()).unwrap());
+        assert_ne!(more, fingerprints(dir.path()).unwrap());
     }
 }

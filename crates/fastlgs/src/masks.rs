@@ -10,7 +10,7 @@ use image::RgbImage;
 use rayon::prelude::*;
 
 /// Computes embedding and colour histogram of every mask of a photo, sorted by label. `map` holds
-/// the label of each pixel.
+/// the label of each pixel. `view` is the view index that the masks get.
 pub fn descriptors(
     name: &str,
     photo: &RgbImage,
@@ -45,8 +45,8 @@ pub fn whole_masks(folder: &SceneFolder, camera: &Camera) -> Result<LabelMap> {
 }
 
 /// Returns the descriptors of all masks of the training views, sorted by view and label. Computes
-/// and stores them if the scene folder has none for its encoder. Only Algorithm 1 and fields
-/// without objects need them: global mapping embeds its objects.
+/// and stores them if the scene folder has none for its encoder. Only Algorithm 1 and
+/// `fastlgs-bench baseline` need them. Global mapping embeds objects instead of masks.
 ///
 /// # Errors
 /// Missing masks or models.

@@ -7,7 +7,7 @@ use fastlgs_core::{Camera, LabelMap, Level, MaskList, SceneFolder};
 use fastlgs_grid::mapping::Mask;
 use fastlgs_grid::{Grid, evidence};
 use fastlgs_vision::import::{self, Import, Lens};
-use fastlgs_vision::pull::Named;
+use fastlgs_vision::pull::ModelPair;
 use fastlgs_vision::sam::{self, Sam};
 use fastlgs_vision::{
     ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder,
@@ -194,7 +194,7 @@ impl ModelChoice {
     fn sam_files(&self) -> Result<[PathBuf; 2]> {
         Ok(match (&self.sam_encoder, &self.sam_decoder) {
             (Some(encoder), Some(decoder)) => [encoder.clone(), decoder.clone()],
-            _ => Named::find(&self.sam)?.pair()?,
+            _ => ModelPair::find(&self.sam)?.pair()?,
         })
     }
 
@@ -210,7 +210,7 @@ impl ModelChoice {
                 "{}: an image tower needs the text tower that belongs to it: --clip-text FILE",
                 image.display()
             ),
-            (None, None) => Named::find(&self.clip)?.pair()?,
+            (None, None) => ModelPair::find(&self.clip)?.pair()?,
         })
     }
 
@@ -314,8 +314,8 @@ impl ModelChoice {
         Ok(files)
     }
 
-    /// Returns what masks depend on besides the photo, for cache keys; `None` for imported masks,
-    /// whose files can change at any time.
+    /// Returns a text that identifies the segmenter, its settings and its model files, for cache
+    /// keys. Returns `None` for imported masks, whose files can change at any time.
     pub fn segmenter_identity(&self) -> Result<Option<String>> {
         Ok(match self.segmenter {
             SegmenterKind::Import => None,
@@ -386,14 +386,13 @@ pub fn text_components<'a>(manifest: &Manifest, embedding: &'a mut [f32]) -> &'a
 }
 
 /// Returns whether `embeddings` are comparable with those of a scene's encoder. `encoder` is the
-/// identity of what made them; empty if unknown.
+/// identity of the encoder that made them; empty if unknown.
 pub(crate) fn is_current<'a>(
     manifest: &Manifest,
     encoder: &str,
     mut embeddings: impl Iterator<Item = &'a Vec<f32>>,
 ) -> bool {
-    // The encoder is unknown: only embeddings of the offline encoder can be checked, by their
-    // length.
+    // Without an identity, only embeddings of the offline encoder can be checked, by their length.
     if encoder.is_empty() {
         manifest.encoder != calibrations::OFFLINE || embeddings.all(|e| e.len() == conse::LENGTH)
     } else {
@@ -413,7 +412,7 @@ pub fn check_version(manifest: &Manifest, grid: &Grid, folder: &SceneFolder) -> 
     ) {
         let root = folder.root.display();
         bail!(
-            "{root}: another encoder than the scene's, or another version of it, embedded its objects; \
+            "{root}: its objects were embedded by another encoder, or by another version of the encoder; \
              run 'fastlgs train {root} --init {root}/scene.ply --iterations 0' to embed them again and keep the Gaussians"
         );
     }
@@ -430,7 +429,7 @@ fn recorded_model<'a>(manifest: &'a Manifest, role: &str) -> Result<&'a Path> {
     let bytes = std::fs::metadata(&file.path)
         .with_context(|| {
             format!(
-                "the {what} of the scene cannot be opened, {}",
+                "{}: the {what} of the scene cannot be opened",
                 file.path.display()
             )
         })?
@@ -482,8 +481,8 @@ pub fn text_encoder_of(
     })
 }
 
-/// Encoder that returns the imported embeddings in the scene folder: each mask gets that of the
-/// imported mask that fits it.
+/// Encoder that returns the imported embeddings in the scene folder. Each mask gets the embedding
+/// of the imported mask that matches it best.
 struct ImportedEmbeddings {
     folder: SceneFolder,
     views: Vec<Camera>,

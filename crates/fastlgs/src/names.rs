@@ -167,7 +167,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_kept_without_capitals_and_forgotten_by_name() {
+    fn names_ignore_case_and_can_be_removed() {
         let example = |from: &str| Example {
             encoder: "offline".into(),
             from: from.into(),

@@ -101,7 +101,7 @@ pub fn load_kept(folder: &SceneFolder, training: &[Camera]) -> Result<Grid> {
 pub struct Mapped {
     /// The objects.
     pub chosen: Chosen,
-    /// Number of objects, and of sets that are no objects.
+    /// Number of masks, of objects, and of sets that did not become objects.
     pub summary: Summary,
 }
 
@@ -218,18 +218,18 @@ impl Mapper<'_> {
         Ok(Mapped { chosen, summary })
     }
 
-    /// Writes the object map of each view, and passes it to `tell`.
+    /// Writes the object map of each view, and passes it to `on_map`.
     pub fn write_maps(
         &mut self,
         scene: &Gaussians,
         mapped: &Mapped,
-        mut tell: impl FnMut(&Camera, &LabelMap) -> Result<()>,
+        mut on_map: impl FnMut(&Camera, &LabelMap) -> Result<()>,
     ) -> Result<()> {
         let folder = self.folder;
         mark_maps_unfinished(folder)?;
         self.render_maps(scene, &mapped.chosen.lists(), |camera, map| {
             map.save(&folder.objects_path(&camera.name))?;
-            tell(camera, &map)
+            on_map(camera, &map)
         })
     }
 
@@ -245,8 +245,8 @@ impl Mapper<'_> {
         let work = self.run.work("objects", self.cameras.len() as u64);
         for camera in self.cameras {
             let view = self.view(camera);
-            let shares = self.engine.render_ids(view, &scene.object_ids)?;
-            take(camera, field::ids(&shares, lists))?;
+            let id_weights = self.engine.render_ids(view, &scene.object_ids)?;
+            take(camera, field::ids(&id_weights, lists))?;
             work.advance()?;
         }
         Ok(())
@@ -284,7 +284,7 @@ pub fn embed_objects(
 ) -> Result<(Grid, Summary)> {
     let lists = chosen.lists();
     let areas: Vec<&[(u32, u32)]> = chosen.support.iter().map(|s| s.areas.as_slice()).collect();
-    let (found, of_found) = embed(
+    let (found, object_of) = embed(
         folder,
         training,
         &chosen.layers(),
@@ -294,7 +294,7 @@ pub fn embed_objects(
     )?;
     let mut grid = Grid::build(
         &found,
-        &of_found,
+        &object_of,
         codes::lattice(chosen.support.len(), run.seed),
     );
     for (object, (parent, support)) in grid
@@ -306,15 +306,16 @@ pub fn embed_objects(
     }
     (grid.overlaps, grid.id_areas, grid.encoder) = (
         chosen.overlaps,
-        chosen.shown,
+        chosen.id_areas,
         model_choice::identity_of(&folder.manifest()?),
     );
     grid.set_codes(scene);
     Ok((grid, summary))
 }
 
-/// Embeds every object in its best views (`embedding_views`). Returns the masks and their object ids. Objects
-/// of one entry of `layers` share no Gaussians, and `lists` holds the objects of each id.
+/// Embeds every object in its best views, and returns the masks and their object ids.
+/// `embedding_views` holds the view indices of each object. Objects in one entry of `layers` share
+/// no Gaussians. `lists` holds the objects of each id.
 fn embed(
     folder: &SceneFolder,
     training: &[Camera],
@@ -364,7 +365,7 @@ fn embed(
         work.advance()?;
         Ok((found, PhotoStats::of(&photo)))
     };
-    let (found, impressions): (Vec<Vec<Mask>>, Vec<PhotoStats>) = training
+    let (found, photo_stats): (Vec<Vec<Mask>>, Vec<PhotoStats>) = training
         .par_iter()
         .enumerate()
         .map(of_view)
@@ -375,7 +376,7 @@ fn embed(
         .unzip();
     let mut found = found.concat();
     let object_of = found.iter().map(|mask| mask.label).collect();
-    let sharpness = photo_quality::weights(&impressions);
+    let sharpness = photo_quality::weights(&photo_stats);
     found
         .iter_mut()
         .for_each(|mask: &mut Mask| mask.area *= sharpness[mask.view]);
@@ -388,7 +389,7 @@ fn embed(
 pub struct Summary {
     /// Number of masks in all views.
     pub masks: usize,
-    /// Memory of the observations, which grows fastest, in MiB.
+    /// Memory of the observations in MiB. It grows faster with the scene than all other data.
     pub megabytes: u32,
     /// Number of sets of Gaussians that the masks elected.
     pub sets: usize,

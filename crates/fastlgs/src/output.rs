@@ -136,10 +136,10 @@ fn check_writable(folder: &Path) -> Result<()> {
             Ok(_) => Ok(()),
         };
     }
-    let ours = std::fs::read_to_string(folder.join(LOCK))
+    let is_unfinished_scene = std::fs::read_to_string(folder.join(LOCK))
         .is_ok_and(|text| text.is_empty() || text.starts_with(LOCK_HEADER));
     match names.first() {
-        Some(name) if !ours => {
+        Some(name) if !is_unfinished_scene => {
             bail!(
                 "it is not empty ('{name}') and has no {MANIFEST}, so it is not a scene; choose a folder that does not exist yet or is empty"
             )
@@ -199,20 +199,20 @@ pub(crate) fn resolve_path(path: &Path) -> Result<PathBuf> {
     if path.as_os_str().is_empty() {
         bail!("the path of the folder is empty; name a folder");
     }
-    let mut known = PathBuf::new();
+    let mut resolved = PathBuf::new();
     for part in std::path::absolute(path)
         .map_err(Error::io(path))?
         .components()
     {
         match part {
-            Component::ParentDir => drop(known.pop()),
+            Component::ParentDir => drop(resolved.pop()),
             Component::CurDir => {}
-            part => known.push(part),
+            part => resolved.push(part),
         }
         // A link is resolved before the parts that follow it.
-        known = known.canonicalize().unwrap_or(known);
+        resolved = resolved.canonicalize().unwrap_or(resolved);
     }
-    Ok(known)
+    Ok(resolved)
 }
 
 #[cfg(test)]
@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn only_new_empty_and_own_folders_are_written() {
+    fn folders_with_other_files_are_refused() {
         let dir = tempfile::tempdir().unwrap();
         let new = dir.path().join("a/b/scene");
         drop(SceneLock::take(&new, "preprocess").unwrap());
@@ -268,7 +268,7 @@ mod tests {
 
     #[test]
     #[cfg(unix)]
-    fn photos_and_scene_lie_apart_whatever_links_say() {
+    fn overlapping_photo_and_scene_folders_are_refused() {
         let dir = tempfile::tempdir().unwrap();
         let at = |name: &str| dir.path().join(name);
         std::fs::create_dir_all(at("album/images")).unwrap();

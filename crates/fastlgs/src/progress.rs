@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn work_is_told_and_cancelled() {
+    fn progress_is_reported_and_a_run_can_be_cancelled() {
         let sink = Record {
             messages: Mutex::default(),
             after: 2,

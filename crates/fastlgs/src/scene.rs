@@ -33,15 +33,15 @@ pub struct Scene {
     trained: TrainReport,
     /// Calibrations to use instead of those of the encoder.
     calibrations: Option<Calibrations>,
-    /// The object table, once it was needed.
+    /// The object table, loaded at its first use.
     grid: OnceCell<Arc<Grid>>,
     /// The view that was rendered last.
     last_field: Option<LastField>,
     texts: OnceCell<Texts>,
     /// Whether taught names are used.
     use_taught_names: bool,
-    /// Cache of the view that shows most of some objects, by object ids.
-    seen_best: BTreeMap<Vec<u16>, Option<String>>,
+    /// Cache of [`Self::most_visible_view`], by object ids.
+    best_views: BTreeMap<Vec<u16>, Option<String>>,
 }
 
 /// Rendered object data of a view, and what it depends on.
@@ -87,7 +87,7 @@ impl Scene {
             last_field: None,
             texts: OnceCell::new(),
             use_taught_names: true,
-            seen_best: BTreeMap::new(),
+            best_views: BTreeMap::new(),
         })
     }
 
@@ -148,20 +148,20 @@ impl Scene {
     /// Replaces the calibrations of the encoder, for measurements.
     pub fn set_calibrations(&mut self, calibrations: Calibrations) {
         self.calibrations = Some(calibrations);
-        self.forget_texts();
+        self.drop_texts();
     }
 
     /// Uses another CLIP text tower than the one that the manifest records.
     pub fn set_clip_text(&mut self, file: Option<PathBuf>) {
         self.clip_text = file;
-        self.forget_texts();
+        self.drop_texts();
     }
 
     /// Replaces the Gaussians of the scene, on the device as well.
     pub fn set_gaussians(&mut self, gaussians: Gaussians) -> Result<()> {
         self.engine.set_state(&State::of(&gaussians))?;
         self.gaussians = gaussians;
-        self.seen_best.clear();
+        self.best_views.clear();
         self.last_field = None;
         Ok(())
     }
@@ -169,7 +169,7 @@ impl Scene {
     /// Replaces the object ids of the Gaussians, one for each.
     pub(crate) fn set_object_ids(&mut self, ids: Vec<u16>) {
         self.gaussians.object_ids = ids;
-        self.seen_best.clear();
+        self.best_views.clear();
         self.last_field = None;
     }
 
@@ -275,7 +275,7 @@ impl Scene {
     fn render_field(&mut self, view: View, tau_ac: Option<f32>) -> Result<Field> {
         let lifted = self.trained.feature_mode == train::FeatureMode::Lift;
         if lifted && tau_ac.is_none() {
-            return Ok(Field::Shares(
+            return Ok(Field::IdWeights(
                 self.engine.render_ids(view, &self.gaussians.object_ids)?,
             ));
         }
@@ -306,7 +306,7 @@ impl Scene {
     pub fn most_visible_view(&mut self, grid: &Grid, ids: &[u16]) -> Result<Option<String>> {
         /// Longer side of the rendered views, in pixels.
         const SEARCH_SIDE: u32 = 128;
-        if let Some(known) = self.seen_best.get(ids) {
+        if let Some(known) = self.best_views.get(ids) {
             return Ok(known.clone());
         }
         let targets: Vec<Hit> = ids
@@ -331,7 +331,7 @@ impl Scene {
                 best = (pixels, Some(camera.name));
             }
         }
-        self.seen_best.insert(ids.to_vec(), best.1.clone());
+        self.best_views.insert(ids.to_vec(), best.1.clone());
         Ok(best.1)
     }
 
@@ -403,7 +403,7 @@ impl Scene {
     }
 
     /// Drops the text encoder. The next query loads it again, with the current taught names.
-    pub fn forget_texts(&mut self) {
+    pub fn drop_texts(&mut self) {
         self.texts = OnceCell::new();
     }
 

@@ -1,4 +1,4 @@
-//! What the stages record in `scene.json`, beside the manifest's own fields.
+//! Notes that the stages record in `scene.json`, in addition to the fields of the manifest.
 
 use crate::preprocess::Brightness;
 use crate::train::TrainReport;
@@ -53,7 +53,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn notes_come_back_and_damaged_ones_are_refused() {
+    fn notes_round_trip_and_damaged_ones_are_refused() {
         let mut manifest: Manifest = serde_json::from_value(serde_json::json!({
             "version": "0.1.0", "photos": "p", "holdout": 8, "segmenter": "offline", "encoder": "offline", "seed": 0,
             "warnings": [],

@@ -65,13 +65,13 @@ impl StagedOutput {
                 path.display()
             );
         }
-        let belongs = |file: &String| {
+        let is_replaced = |file: &String| {
             replaced
                 .iter()
                 .any(|name| Path::new(file).starts_with(name))
         };
         let (old, kept): (BTreeSet<String>, BTreeSet<String>) =
-            listed.into_iter().partition(belongs);
+            listed.into_iter().partition(is_replaced);
         // A file that the stage writes again is replaced as well.
         let (old, kept) = (&old | &(&kept & &new), &kept - &new);
         let files = &kept | &new;
@@ -91,7 +91,7 @@ impl StagedOutput {
             .map(|name| (self.folder.root.join(name), scene.root.join(name)));
         let mut moved = Vec::new();
         let done = moves_out.chain(moves_in).try_for_each(|(from, to)| {
-            if rename_if_there(&from, &to)? {
+            if rename_if_exists(&from, &to)? {
                 moved.push((from, to));
                 stop_point::reach("publish", moved.len() as u64);
             }
@@ -134,7 +134,7 @@ impl StagedOutput {
                     .iter()
                     .find(|staged| staged.root.join(MANIFEST).is_file())
             }) {
-                put_back(scene, staged)?;
+                restore_earlier_scene(scene, staged)?;
             }
         }
         for staged in staged {
@@ -145,7 +145,7 @@ impl StagedOutput {
 }
 
 /// Moves the files of a killed run out of the scene, and the replaced files back into it.
-fn put_back(scene: &SceneFolder, staged: &SceneFolder) -> Result<()> {
+fn restore_earlier_scene(scene: &SceneFolder, staged: &SceneFolder) -> Result<()> {
     let before = staged.root.join(REPLACED_FOLDER);
     let old = if before.is_dir() {
         files_in(&before)?
@@ -164,10 +164,10 @@ fn put_back(scene: &SceneFolder, staged: &SceneFolder) -> Result<()> {
         .into_iter()
         .filter(|file| !kept.contains(file) || old.contains(file));
     for name in moved_in.filter(|file| !staged.root.join(file).exists()) {
-        rename_if_there(&scene.root.join(&name), &staged.root.join(&name))?;
+        rename_if_exists(&scene.root.join(&name), &staged.root.join(&name))?;
     }
     for name in old.iter().chain([&MANIFEST.to_owned()]) {
-        rename_if_there(&before.join(name), &scene.root.join(name))?;
+        rename_if_exists(&before.join(name), &scene.root.join(name))?;
     }
     Ok(())
 }
@@ -214,7 +214,7 @@ fn remove_empty_folders(root: &Path, file: &str) {
 }
 
 /// Renames a file if it exists, and returns whether it did.
-fn rename_if_there(from: &Path, to: &Path) -> Result<bool> {
+fn rename_if_exists(from: &Path, to: &Path) -> Result<bool> {
     if !from.exists() {
         return Ok(false);
     }
@@ -248,7 +248,7 @@ mod tests {
     const REPLACED: [&str; 3] = ["photos", "alpha", "cameras"];
 
     /// Creates a scene whose files contain "old".
-    fn earlier(root: &Path) -> SceneFolder {
+    fn create_earlier_scene(root: &Path) -> SceneFolder {
         let scene = SceneFolder::new(root);
         let staged = StagedOutput::new(&scene, "first").unwrap();
         for name in [
@@ -272,7 +272,7 @@ mod tests {
     }
 
     /// Stages new output without publishing it.
-    fn begun(scene: &SceneFolder) -> StagedOutput {
+    fn stage_new_output(scene: &SceneFolder) -> StagedOutput {
         let staged = StagedOutput::new(scene, "preprocess").unwrap();
         for name in ["photos/b.png", "photos/same.png", "cameras/cameras.json"] {
             write(&staged.folder, name, "new");
@@ -281,10 +281,10 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_is_the_earlier_one_or_the_new_one() {
+    fn publishing_replaces_the_earlier_scene() {
         let dir = tempfile::tempdir().unwrap();
-        let scene = earlier(dir.path());
-        drop(begun(&scene));
+        let scene = create_earlier_scene(dir.path());
+        drop(stage_new_output(&scene));
         assert_eq!(
             (
                 read(&scene, "photos/same.png").as_deref(),
@@ -292,7 +292,7 @@ mod tests {
             ),
             (Some("old"), None)
         );
-        begun(&scene)
+        stage_new_output(&scene)
             .publish(&scene, &REPLACED, [], &manifest("sam"))
             .unwrap();
         for gone in [
@@ -324,15 +324,15 @@ mod tests {
     #[test]
     fn files_of_the_users_are_neither_moved_nor_replaced() {
         let dir = tempfile::tempdir().unwrap();
-        let scene = earlier(dir.path());
+        let scene = create_earlier_scene(dir.path());
         write(&scene, "photos/IMG_1.CR3", "mine");
-        begun(&scene)
+        stage_new_output(&scene)
             .publish(&scene, &REPLACED, [], &manifest("sam"))
             .unwrap();
         assert_eq!(read(&scene, "photos/IMG_1.CR3").as_deref(), Some("mine"));
         // A user's file with the name of a staged file.
         write(&scene, "ignore/b.png", "mine");
-        let staged = begun(&scene);
+        let staged = stage_new_output(&scene);
         write(&staged.folder, "ignore/b.png", "new");
         let refused = staged
             .publish(&scene, &["photos", "ignore"], [], &manifest("import"))
@@ -355,9 +355,9 @@ mod tests {
     #[test]
     fn a_move_that_fails_is_undone() {
         let dir = tempfile::tempdir().unwrap();
-        let scene = earlier(dir.path());
+        let scene = create_earlier_scene(dir.path());
         // A file cannot replace a folder.
-        let staged = begun(&scene);
+        let staged = stage_new_output(&scene);
         write(&staged.folder, "scene.ply", "new");
         std::fs::create_dir_all(staged.folder.root.join(REPLACED_FOLDER).join("scene.ply"))
             .unwrap();
@@ -378,8 +378,8 @@ mod tests {
     fn a_killed_move_is_undone_by_the_next_run() {
         for moved_in in 0..3 {
             let dir = tempfile::tempdir().unwrap();
-            let scene = earlier(dir.path());
-            let staged = begun(&scene);
+            let scene = create_earlier_scene(dir.path());
+            let staged = stage_new_output(&scene);
             let before = staged.folder.root.join(REPLACED_FOLDER);
             // The run is killed after it moved all replaced files away and some new ones in.
             let files = files_in(&staged.folder.root).unwrap();
@@ -397,10 +397,10 @@ mod tests {
                 "photos/same.png",
                 "cameras/trained.json",
             ] {
-                rename_if_there(&scene.root.join(name), &before.join(name)).unwrap();
+                rename_if_exists(&scene.root.join(name), &before.join(name)).unwrap();
             }
             for name in files.iter().rev().take(moved_in) {
-                rename_if_there(&staged.folder.root.join(name), &scene.root.join(name)).unwrap();
+                rename_if_exists(&staged.folder.root.join(name), &scene.root.join(name)).unwrap();
             }
             std::mem::forget(staged);
             StagedOutput::recover(&scene).unwrap();
@@ -432,7 +432,7 @@ mod tests {
     fn a_first_run_that_was_killed_leaves_nothing_in_the_way() {
         let dir = tempfile::tempdir().unwrap();
         let scene = SceneFolder::new(dir.path());
-        let staged = begun(&scene);
+        let staged = stage_new_output(&scene);
         let files = files_in(&staged.folder.root).unwrap();
         staged
             .folder
@@ -442,11 +442,11 @@ mod tests {
             })
             .unwrap();
         for name in files.iter().take(2) {
-            rename_if_there(&staged.folder.root.join(name), &scene.root.join(name)).unwrap();
+            rename_if_exists(&staged.folder.root.join(name), &scene.root.join(name)).unwrap();
         }
         std::mem::forget(staged);
         StagedOutput::recover(&scene).unwrap();
-        begun(&scene)
+        stage_new_output(&scene)
             .publish(&scene, &REPLACED, [], &manifest("sam"))
             .unwrap();
         assert_eq!(read(&scene, "photos/b.png").as_deref(), Some("new"));

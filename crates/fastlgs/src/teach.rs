@@ -3,7 +3,7 @@
 use crate::error::{Context, bail};
 use crate::names::{Example, Names, normalise_name};
 use crate::query::Pixels;
-use crate::query::object_query::{ObjectQuery, picture};
+use crate::query::object_query::{ObjectQuery, picture_query};
 use crate::{Result, Run, Scene, model_choice};
 use fastlgs_core::image_io;
 use fastlgs_grid::Grid;
@@ -57,20 +57,20 @@ pub struct TeachReport {
 /// # Errors
 /// An empty name, an example without an object, none or several examples, or a file that cannot be
 /// written. The names then remain unchanged.
-pub fn teach(lesson: &TeachConfig, run: &Run) -> Result<TeachReport> {
-    let mut scene = Scene::open(&lesson.scene, run.device)?;
-    let object = match (lesson.object, &lesson.point, &lesson.image) {
+pub fn teach(config: &TeachConfig, run: &Run) -> Result<TeachReport> {
+    let mut scene = Scene::open(&config.scene, run.device)?;
+    let object = match (config.object, &config.point, &config.image) {
         (Some(id), None, None) => Some(id),
-        (None, Some(pixels), None) => Some(object_at(&mut scene, lesson, pixels)?),
+        (None, Some(pixels), None) => Some(object_at(&mut scene, config, pixels)?),
         (None, None, Some(_)) => None,
         _ => {
             bail!("give exactly one example: --point X,Y with --view, --object ID, or --image FILE")
         }
     };
-    match (object, &lesson.image) {
-        (Some(id), _) => teach_object(&scene, &*scene.grid()?, &lesson.name, id),
+    match (object, &config.image) {
+        (Some(id), _) => teach_object(&scene, &*scene.grid()?, &config.name, id),
         (None, Some(path)) => {
-            let embeddings = picture(
+            let embeddings = picture_query(
                 &scene,
                 &path.display().to_string(),
                 &image_io::load_rgb(path)?,
@@ -78,7 +78,7 @@ pub fn teach(lesson: &TeachConfig, run: &Run) -> Result<TeachReport> {
             .positive;
             store_example(
                 &scene,
-                &lesson.name,
+                &config.name,
                 None,
                 path.display().to_string(),
                 embeddings,
@@ -151,8 +151,8 @@ fn store_example(
 }
 
 /// Returns the id of the object at pixels of a view.
-fn object_at(scene: &mut Scene, lesson: &TeachConfig, pixels: &Pixels) -> Result<u16> {
-    let view = lesson
+fn object_at(scene: &mut Scene, config: &TeachConfig, pixels: &Pixels) -> Result<u16> {
+    let view = config
         .view
         .as_deref()
         .context("a point needs the name of its view; set view as well")?;

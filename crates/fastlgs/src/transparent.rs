@@ -19,13 +19,15 @@ const LOGIT: f32 = 1.25 * TRANSPARENT_LOGIT;
 const EMPTY_TRANSMITTANCE: f32 = 0.5;
 
 /// Returns whether a Gaussian is transparent.
-pub fn is_clear(scene: &Gaussians, gaussian: usize) -> bool {
+pub fn is_transparent(scene: &Gaussians, gaussian: usize) -> bool {
     scene.opacity_logits[gaussian] <= TRANSPARENT_LOGIT
 }
 
 /// Returns the number of transparent Gaussians.
 pub fn count(scene: &Gaussians) -> usize {
-    (0..scene.len()).filter(|i| is_clear(scene, *i)).count()
+    (0..scene.len())
+        .filter(|i| is_transparent(scene, *i))
+        .count()
 }
 
 /// Removes the Gaussians for which `stays` is false.
@@ -37,24 +39,26 @@ fn retain(scene: &mut Gaussians, stays: impl Fn(&Gaussians, usize) -> bool) {
 }
 
 /// Removes the transparent Gaussians from a scene and returns them.
-pub fn take(scene: &mut Gaussians) -> Gaussians {
-    let clear: Vec<usize> = (0..scene.len()).filter(|i| is_clear(scene, *i)).collect();
+pub fn take_transparent(scene: &mut Gaussians) -> Gaussians {
+    let clear: Vec<usize> = (0..scene.len())
+        .filter(|i| is_transparent(scene, *i))
+        .collect();
     let taken = scene.select(&clear);
-    retain(scene, |scene, i| !is_clear(scene, i));
+    retain(scene, |scene, i| !is_transparent(scene, i));
     taken
 }
 
 /// Removes transparent Gaussians that belong to no object.
-pub fn keep_owned(scene: &mut Gaussians) {
+pub fn remove_unowned(scene: &mut Gaussians) {
     retain(scene, |scene, i| {
-        !is_clear(scene, i) || scene.object_ids[i] > 0
+        !is_transparent(scene, i) || scene.object_ids[i] > 0
     });
 }
 
 /// Maps masks to objects as [`Mapper::map`] does, transparent objects included. Writes the object
 /// maps.
 pub fn map(mapper: &mut Mapper, scene: &mut Gaussians) -> Result<Mapped> {
-    forget(scene);
+    remove_faint(scene);
     let mapped = mapper.map(scene)?;
     let lists = mapped.chosen.lists();
     let mut left = Vec::with_capacity(mapper.cameras.len());
@@ -63,15 +67,16 @@ pub fn map(mapper: &mut Mapper, scene: &mut Gaussians) -> Result<Mapped> {
         left.push(unexplained(folder, camera, shown, &lists, min_support)?);
         Ok(())
     })?;
-    let Some(with_clear) = add(mapper, scene, left)? else {
+    let Some(with_clear) = add_transparent_objects(mapper, scene, left)? else {
         return Ok(mapped);
     };
     mapper.write_maps(scene, &with_clear, |_, _| Ok(()))?;
     Ok(with_clear)
 }
 
-/// Removes Gaussians with an alpha below 1/255: transparent ones of an earlier run, and faded ones.
-fn forget(scene: &mut Gaussians) {
+/// Removes Gaussians with an opacity below 1/255: transparent ones of an earlier run, and faded
+/// ones.
+fn remove_faint(scene: &mut Gaussians) {
     retain(scene, |scene, i| {
         255.0 * sigmoid(scene.opacity_logits[i]) >= 1.0
     });
@@ -79,7 +84,7 @@ fn forget(scene: &mut Gaussians) {
 
 /// Adds transparent Gaussians where `unexplained` masks of the views agree, and maps the objects
 /// again. Returns `None` if no transparent object is found.
-fn add(
+fn add_transparent_objects(
     mapper: &mut Mapper,
     scene: &mut Gaussians,
     unexplained: Vec<Vec<bool>>,
@@ -88,8 +93,11 @@ fn add(
     if hulls.is_empty() {
         return Ok(None);
     }
-    let (shown, before) = (scene.len(), scene.object_ids.clone());
-    let mut places: Vec<Range<usize>> = hulls.iter().map(|hull| put(scene, hull)).collect();
+    let (solid_count, before) = (scene.len(), scene.object_ids.clone());
+    let mut hull_gaussians: Vec<Range<usize>> = hulls
+        .iter()
+        .map(|hull| add_hull_gaussians(scene, hull))
+        .collect();
     loop {
         let mapped = mapper.map(scene)?;
         let lists = mapped.chosen.lists();
@@ -98,22 +106,24 @@ fn add(
             .iter()
             .map(|id| lists[usize::from(*id)].as_slice())
             .collect();
-        let kept: Vec<Vec<usize>> = places
+        let kept: Vec<Vec<usize>> = hull_gaussians
             .iter()
             .map(|places| gaussians_of_object(&lists, places.clone()))
             .collect();
-        let all: Vec<usize> = (0..shown).chain(kept.iter().flatten().copied()).collect();
+        let all: Vec<usize> = (0..solid_count)
+            .chain(kept.iter().flatten().copied())
+            .collect();
         tracing::debug!(
-            hulls = places.len(),
-            put = scene.len() - shown,
-            kept = all.len() - shown,
+            hulls = hull_gaussians.len(),
+            put = scene.len() - solid_count,
+            kept = all.len() - solid_count,
             "transparent Gaussians"
         );
         if all.len() == scene.len() {
             return Ok(Some(mapped));
         }
         *scene = scene.select(&all);
-        if all.len() == shown {
+        if all.len() == solid_count {
             scene.object_ids = before;
             return Ok(None);
         }
@@ -122,21 +132,26 @@ fn add(
             *end += kept.len();
             Some(*end - kept.len()..*end)
         };
-        places = kept.iter().scan(shown, following).collect();
+        hull_gaussians = kept.iter().scan(solid_count, following).collect();
     }
 }
 
-/// Returns the pixels of a view that have masks, but none that an object fits. The result is scaled
-/// to at most [`SEARCH_SIDE`] pixels. `shown` is the object map of the view, and `lists` holds the objects
-/// of each id.
+/// Returns the pixels of a view that lie in masks, none of which matches an object. The result is
+/// scaled to at most [`SEARCH_SIDE`] pixels. `object_map` is that of the view. `lists` holds the
+/// objects of each id.
 fn unexplained(
     folder: &SceneFolder,
     camera: &Camera,
-    shown: &LabelMap,
+    object_map: &LabelMap,
     lists: &[Vec<u16>],
     min_support: f32,
 ) -> Result<Vec<bool>> {
-    let pixels = hull::unexplained(&objects::atoms(folder, camera)?, shown, lists, min_support);
+    let pixels = hull::unexplained(
+        &objects::atoms(folder, camera)?,
+        object_map,
+        lists,
+        min_support,
+    );
     let small = camera.shrunk_to(SEARCH_SIDE);
     let at = |k: u32, from: u32, to: u32| ((2 * k + 1) * from / (2 * to)) as usize;
     let columns = |x| at(x, camera.width, small.width);
@@ -207,7 +222,7 @@ fn depth(
 }
 
 /// Adds the transparent Gaussians of a hull to a scene, and returns their indices.
-fn put(scene: &mut Gaussians, hull: &Hull) -> Range<usize> {
+fn add_hull_gaussians(scene: &mut Gaussians, hull: &Hull) -> Range<usize> {
     let first = scene.len();
     for place in &hull.points {
         scene.push_sphere(*place, 0.5 * hull.spacing, sigmoid(LOGIT), [0.5; 3]);
@@ -216,28 +231,26 @@ fn put(scene: &mut Gaussians, hull: &Hull) -> Range<usize> {
     first..scene.len()
 }
 
-/// Returns the Gaussians of a hull (`places`) that belong to its object; none if it has no object.
-/// Hull and object must each contain more than half of the other. `lists` holds the objects of each
-/// Gaussian.
-fn gaussians_of_object(lists: &[&[u16]], places: Range<usize>) -> Vec<usize> {
+/// Returns the Gaussians of a hull that belong to its object; none if it has no object. `hull`
+/// holds the indices of its Gaussians. Hull and object must each contain more than half of the
+/// other. `lists` holds the objects of each Gaussian.
+fn gaussians_of_object(lists: &[&[u16]], hull: Range<usize>) -> Vec<usize> {
     let mut held: BTreeMap<u16, usize> = BTreeMap::new();
-    places
-        .clone()
+    hull.clone()
         .flat_map(|place| lists[place])
         .for_each(|object| *held.entry(*object).or_default() += 1);
     // Nested objects can each contain more than half of the hull: take the smallest.
     let all = |object: u16| lists.iter().filter(|list| list.contains(&object)).count();
     let most = held
         .into_iter()
-        .filter(|(_, common)| 2 * common > places.len())
+        .filter(|(_, common)| 2 * common > hull.len())
         .map(|(object, common)| (all(object), common, object));
     let object = most
         .min()
         .filter(|(all, common, _)| 2 * common > *all)
         .map(|found| found.2);
     object.map_or_else(Vec::new, |object| {
-        places
-            .filter(|place| lists[*place].contains(&object))
+        hull.filter(|place| lists[*place].contains(&object))
             .collect()
     })
 }
@@ -292,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pane_that_shows_nothing_becomes_an_object() {
+    fn an_invisible_pane_with_masks_becomes_an_object() {
         let dir = tempfile::tempdir().unwrap();
         let folder = SceneFolder::new(dir.path());
         let (mut scene, cameras) = scene(&folder);
@@ -330,7 +343,9 @@ mod tests {
             .unwrap()
         };
         let left = cameras.iter().map(left).collect();
-        let mapped = add(&mut mapper, &mut scene, left).unwrap().expect("a pane");
+        let mapped = add_transparent_objects(&mut mapper, &mut scene, left)
+            .unwrap()
+            .expect("a pane");
         let supports: Vec<f32> = mapped
             .chosen
             .support
@@ -345,16 +360,16 @@ mod tests {
             "Gaussians without an object are removed"
         );
         let mut rest = scene.clone();
-        let taken = take(&mut rest);
+        let taken = take_transparent(&mut rest);
         assert_eq!(
             (rest.means, taken.means.as_slice()),
             (wall.means.clone(), &scene.means[wall.len()..])
         );
         *scene.object_ids.last_mut().unwrap() = 0;
         let all = scene.len();
-        keep_owned(&mut scene);
+        remove_unowned(&mut scene);
         assert_eq!(scene.len(), all - 1);
-        forget(&mut scene);
+        remove_faint(&mut scene);
         assert_eq!(scene.means, wall.means);
     }
 }

@@ -6,7 +6,7 @@ use anyhow::Result;
 use fastlgs::model_choice::{EncoderKind, ModelChoice};
 use fastlgs::{Run, calibrate, calibrations};
 use fastlgs_core::scene_folder::ModelFile;
-use fastlgs_vision::pull::{self, HOST, NAMED, Named, Role};
+use fastlgs_vision::pull::{self, HOST, MODEL_PAIRS, ModelPair, Role};
 use fastlgs_vision::{model_paths, models};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -65,17 +65,17 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         } => {
             let (clip, clip_image, clip_text) =
                 (clip.clone(), clip_image.clone(), clip_text.clone());
-            let eyes = ModelChoice {
+            let choice = ModelChoice {
                 encoder: EncoderKind::Clip,
                 clip,
                 clip_image,
                 clip_text,
                 ..ModelChoice::default()
             };
-            return report::write_fields(common, &calibrate::calibrate(&eyes, run)?);
+            return report::write_fields(common, &calibrate::calibrate(&choice, run)?);
         }
         Action::Pull { name, base_url } => {
-            let model = Named::find(name)?;
+            let model = ModelPair::find(name)?;
             let work = run.work("download", 0);
             let report_progress = |file: &str, done: u64, total: Option<u64>| {
                 work.set_progress(done, total.unwrap_or(done), file)
@@ -95,9 +95,9 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     }
     let packages = models::OFFLINE_PACKAGES
         .map(|(name, licence)| serde_json::json!({ "package": name, "licence": licence }));
-    let named = NAMED.map(|model| {
+    let named = MODEL_PAIRS.map(|model| {
         let files: Option<BTreeMap<String, ModelFile>> = fastlgs_core::fs::read_json(&model.folder().join("pulled.json")).ok();
-        let calibrated = model.role == Role::Clip && model.pair().is_ok_and(|[image, _]| calibrations::is_measured(&image));
+        let calibrated = model.role == Role::Clip && model.pair().is_ok_and(|[image, _]| calibrations::has_calibration_file(&image));
         serde_json::json!({ "model": model, "from": format!("{HOST}/{}", model.repository), "pulled": files, "calibrated": calibrated })
     });
     let value = serde_json::json!({

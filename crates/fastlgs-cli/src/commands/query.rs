@@ -175,7 +175,7 @@ struct QueryRunner<'a> {
     scene: Scene,
     grid: Arc<Grid>,
     cameras: Vec<Camera>,
-    shown: Option<RenderedView>,
+    rendered_view: Option<RenderedView>,
     tiles: Vec<Tile>,
     /// Folder of the pictures.
     output: Option<PathBuf>,
@@ -216,8 +216,8 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         };
         return library::run(root, config, &texts, common, run);
     }
-    let shown = !args.point.is_empty() || !args.image.is_empty();
-    if shown && !args.text.is_empty() {
+    let by_example = !args.point.is_empty() || !args.image.is_empty();
+    if by_example && !args.text.is_empty() {
         bail!("query in one way: by text, by --point or by --image");
     }
     let lines = args.text.iter().any(|t| t == "-");
@@ -248,21 +248,21 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         scene.text_query("warm up")?;
     }
     scene.warm_up()?;
-    let mut asker = QueryRunner {
+    let mut runner = QueryRunner {
         args,
         scene,
         grid,
         cameras,
-        shown: None,
+        rendered_view: None,
         tiles: Vec::new(),
         output: args.output.clone(),
     };
     match lines {
         true if std::io::stdin().is_terminal() && std::io::stdout().is_terminal() => {
-            asker.converse()
+            runner.run_dialogue()
         }
-        true => asker.answer_lines(),
-        false => asker.answer_arguments(common),
+        true => runner.answer_lines(),
+        false => runner.answer_arguments(common),
     }
 }
 
@@ -284,14 +284,14 @@ impl QueryRunner<'_> {
             .map(picture)
             .collect::<Result<Vec<_>>>()?;
         let points = self.args.point.iter().cloned().map(ObjectQuery::Point);
-        let asks: Vec<ObjectQuery> = texts.chain(pictures).chain(points).collect();
-        if asks.len() > 1 && (self.args.export.is_some() || self.args.export_rest.is_some()) {
+        let queries: Vec<ObjectQuery> = texts.chain(pictures).chain(points).collect();
+        if queries.len() > 1 && (self.args.export.is_some() || self.args.export_rest.is_some()) {
             bail!("--export and --export-rest need a single query; leave out the others");
         }
         let mut answers = Vec::new();
         for place in 0..self.cameras.len() {
-            for ask in &asks {
-                answers.push(self.answer(ask, place)?);
+            for query in &queries {
+                answers.push(self.answer(query, place)?);
             }
         }
         let sheet = self.sheet()?;
@@ -310,7 +310,10 @@ impl QueryRunner<'_> {
                 .for_each(|path| print_line!("contact sheet: {}", path.display()));
         }
         if !found && !common.quiet {
-            let names: Vec<String> = asks.iter().map(|a| format!("\"{}\"", a.name())).collect();
+            let names: Vec<String> = queries
+                .iter()
+                .map(|a| format!("\"{}\"", a.name()))
+                .collect();
             eprintln!("nothing in this scene matches {}", names.join(", "));
         }
         Ok(if found {
@@ -368,11 +371,12 @@ impl QueryRunner<'_> {
         Ok(Outcome::Done)
     }
 
-    /// Renders the colour of a view for pictures, unless there are none or it was rendered last.
-    fn show(&mut self, view_index: usize, field: &Field) -> Result<()> {
+    /// Renders the colour of a view for the pictures, and adds its tiles to the sheet. Does nothing
+    /// without an output folder, or if this view was rendered last.
+    fn render_view_tiles(&mut self, view_index: usize, field: &Field) -> Result<()> {
         if self.output.is_none()
             || self
-                .shown
+                .rendered_view
                 .as_ref()
                 .is_some_and(|s| s.view_index == view_index)
         {
@@ -387,7 +391,7 @@ impl QueryRunner<'_> {
             &color,
             field,
         ));
-        self.shown = Some(RenderedView { view_index, color });
+        self.rendered_view = Some(RenderedView { view_index, color });
         Ok(())
     }
 
@@ -407,8 +411,8 @@ impl QueryRunner<'_> {
             .dilate(dilate)
             .tau_ac(args.tau_ac)
             .run()?;
-        self.show(view_index, &answer.field)?;
-        if let (Some(folder), Some(view)) = (&self.output, &self.shown) {
+        self.render_view_tiles(view_index, &answer.field)?;
+        if let (Some(folder), Some(view)) = (&self.output, &self.rendered_view) {
             let picture = answer.write(folder, &view.color, args.heatmap)?;
             let report = &answer.report;
             self.tiles
@@ -418,7 +422,7 @@ impl QueryRunner<'_> {
         Ok(answer.report)
     }
 
-    /// Writes the Gaussians of an answer, and the others, if asked to.
+    /// Writes the Gaussians of an answer to `--export`, and all others to `--export-rest`.
     fn export(&self, answer: &Answer) -> Result<()> {
         let ids = answer.target_ids();
         for (path, keep) in [(&self.args.export, true), (&self.args.export_rest, false)] {

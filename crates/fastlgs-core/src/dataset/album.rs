@@ -59,10 +59,11 @@ impl Album {
     /// Returns the photo of each name, or `None` if it is not found.
     ///
     /// A name is a path relative to `base`, PHOTOS/images, PHOTOS/input or PHOTOS, with or without
-    /// extension. If no such file exists, the longest trailing part of the path that is a file
-    /// counts. The last attempt compares file names and ignores case, extension and Unicode
-    /// normalization. If several photos fit, their parent folders decide. Inexact matches are
-    /// discarded if the photo has an exact match, or if two names match it.
+    /// extension. If no such file exists, the longest trailing part of the path that is a file is
+    /// used. The last attempt compares file names and ignores case, extension and Unicode
+    /// normalization. If several photos match, the one whose parent folders agree best is used, and
+    /// none on a tie. These inexact matches are discarded if the photo has an exact match, or if
+    /// two names match it.
     pub fn find(&self, names: &[String], base: &Path) -> Vec<Option<PathBuf>> {
         let mut folders = vec![base.to_owned()];
         folders.extend(

@@ -120,8 +120,8 @@ pub fn load(album: &Album, base: &Path, folder: &Path) -> Result<ParsedPoses> {
         } else {
             points_txt(&points)?
         };
-        // Some programs write no colours, so that all points are black. The photos then give the
-        // colours.
+        // Some programs write no colours, so that all points are black. Their colours are then
+        // sampled from the photos.
         let colorless = read.iter().all(|point| point.color == [0; 3]);
         let seen_in = |point: &Point| {
             point
@@ -130,7 +130,7 @@ pub fn load(album: &Album, base: &Path, folder: &Path) -> Result<ParsedPoses> {
                 .filter_map(|id| photo_of.get(id).copied())
                 .collect()
         };
-        stated.shown_in = if colorless {
+        stated.track_photos = if colorless {
             read.iter().map(seen_in).collect()
         } else {
             Vec::new()
@@ -166,6 +166,7 @@ fn posed(path: PathBuf, image: &Registered, lens: &Lens) -> PosedPhoto {
     }
 }
 
+/// Converts the parameters `p` of a COLMAP camera model, in COLMAP's order.
 fn lens(path: &Path, model: &str, width: u64, height: u64, p: &[f64]) -> Result<Lens> {
     let d = |i: usize| p[i] as f32;
     let none = Distortion::default();
@@ -293,6 +294,7 @@ fn lens(path: &Path, model: &str, width: u64, height: u64, p: &[f64]) -> Result<
 fn cameras_bin(path: &Path) -> Result<HashMap<u32, Lens>> {
     let data = fs::read(path)?;
     let mut bytes = ByteReader::new(path, &data);
+    // Id, model, width and height of a camera take 24 bytes; its parameters follow.
     let count = bytes.count(24)?;
     let mut lenses = HashMap::new();
     for _ in 0..count {
@@ -310,6 +312,7 @@ fn cameras_bin(path: &Path) -> Result<HashMap<u32, Lens>> {
 fn images_bin(path: &Path) -> Result<Vec<Registered>> {
     let data = fs::read(path)?;
     let mut bytes = ByteReader::new(path, &data);
+    // An image takes at least 73 bytes: id, pose, camera id, end of the name, observation count.
     let count = bytes.count(73)?;
     (0..count)
         .map(|_| {
@@ -320,6 +323,7 @@ fn images_bin(path: &Path) -> Result<Vec<Registered>> {
             }
             let lens = bytes.u32()?;
             let name = bytes.c_string()?.to_owned();
+            // An observation has 24 bytes: x and y (f64), and the id of its point (u64).
             let observations = bytes.count(24)?;
             bytes.take(observations * 24)?;
             let [w, x, y, z, tx, ty, tz] = pose;
@@ -337,6 +341,7 @@ fn images_bin(path: &Path) -> Result<Vec<Registered>> {
 fn points_bin(path: &Path) -> Result<Vec<Point>> {
     let data = fs::read(path)?;
     let mut bytes = ByteReader::new(path, &data);
+    // A point takes at least 51 bytes: id, position, colour, reprojection error, track length.
     let count = bytes.count(51)?;
     (0..count)
         .map(|_| {

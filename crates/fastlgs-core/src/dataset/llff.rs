@@ -45,7 +45,7 @@ pub fn load(photos: &Path) -> Result<ParsedPoses> {
         return Err(Error::format(
             &path,
             format!(
-                "{rows} poses for {count} photos in images/; each photo needs one row, in the order of the file names"
+                "{rows} poses for {count} photos; each photo needs one row, in the order of the file names"
             ),
         ));
     }

@@ -54,7 +54,7 @@ pub struct ParsedPoses {
     /// Points in world coordinates with their colours, 0 to 255.
     points: Vec<(DVec3, [u8; 3])>,
     /// For each point, the indices of the photos in its track. Empty if the points have colours.
-    shown_in: Vec<Vec<u32>>,
+    track_photos: Vec<Vec<u32>>,
     /// Conventions in which the poses may be written. The first is the default.
     conventions: Vec<PoseConvention>,
     /// Photos that the data set reserves for testing.
@@ -71,7 +71,7 @@ pub struct Dataset {
     pub points: Vec<SfmPoint>,
     /// For each point, the indices of the photos in its track; an empty entry means unknown. The
     /// list is empty if the points have colours.
-    pub shown_in: Vec<Vec<u32>>,
+    pub track_photos: Vec<Vec<u32>>,
     /// Frame of the cameras and points.
     pub frame: WorldFrame,
     /// Conventions in which the poses may be written. The first is the default.
@@ -84,7 +84,7 @@ pub struct Dataset {
     /// Gaussians remain valid.
     pub earlier_frame: Option<WorldFrame>,
     /// Points in world coordinates, in the order of `points`.
-    stated_points: Vec<DVec3>,
+    world_points: Vec<DVec3>,
 }
 
 impl Dataset {
@@ -104,7 +104,7 @@ impl Dataset {
         for (photo, pose) in self.photos.iter_mut().zip(&poses) {
             photo.camera.world_to_camera = self.frame.local_pose(pose);
         }
-        for (point, world) in self.points.iter_mut().zip(&self.stated_points) {
+        for (point, world) in self.points.iter_mut().zip(&self.world_points) {
             point.position = self.frame.to_local(*world);
         }
     }
@@ -242,15 +242,19 @@ fn assembled(photos: &Path, album: &Album, mut stated: ParsedPoses) -> Result<Da
             .name
             .cmp(&stated.photos[*b].camera.name)
     });
-    let mut place = vec![0; order.len()];
+    let mut new_index = vec![0; order.len()];
     order
         .iter()
         .enumerate()
-        .for_each(|(new, old)| place[*old] = new as u32);
-    let renumbered =
-        |photos: &Vec<u32>| photos.iter().map(|photo| place[*photo as usize]).collect();
+        .for_each(|(new, old)| new_index[*old] = new as u32);
+    let renumbered = |photos: &Vec<u32>| {
+        photos
+            .iter()
+            .map(|photo| new_index[*photo as usize])
+            .collect()
+    };
     let mut dataset = Dataset {
-        shown_in: stated.shown_in.iter().map(renumbered).collect(),
+        track_photos: stated.track_photos.iter().map(renumbered).collect(),
         photos: order
             .into_iter()
             .map(|old| stated.photos[old].clone())
@@ -286,13 +290,15 @@ fn assembled(photos: &Path, album: &Album, mut stated: ParsedPoses) -> Result<Da
         ));
     }
     let mut keep = finite.iter();
-    dataset.shown_in.retain(|_| *keep.next().unwrap_or(&true));
+    dataset
+        .track_photos
+        .retain(|_| *keep.next().unwrap_or(&true));
     for (position, color) in stated
         .points
         .into_iter()
         .filter(|(position, _)| position.is_finite())
     {
-        dataset.stated_points.push(position);
+        dataset.world_points.push(position);
         dataset.points.push(SfmPoint {
             position: Vec3::ZERO,
             color,
@@ -455,15 +461,15 @@ fn join_first(names: &[String]) -> String {
             .map(|c| if c.is_control() { '?' } else { c })
             .collect::<String>()
     };
-    let shown = names
+    let joined = names
         .iter()
         .take(5)
         .map(printable)
         .collect::<Vec<_>>()
         .join(", ");
     if names.len() > 5 {
-        format!("{shown}, ...")
+        format!("{joined}, ...")
     } else {
-        shown
+        joined
     }
 }

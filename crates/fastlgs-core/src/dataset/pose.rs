@@ -108,7 +108,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn all_conventions_state_the_same_pose() {
+    fn all_conventions_convert_to_the_same_pose() {
         let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
         let rotation = DQuat::from_rotation_y(0.7) * DQuat::from_rotation_x(-0.4);
         let c2w = DMat4::from_rotation_translation(rotation, DVec3::new(1.0, 2.0, 3.0));

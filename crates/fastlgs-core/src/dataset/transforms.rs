@@ -241,7 +241,7 @@ fn posed(
         )
     })?;
     let coefficient = |f: fn(&Lens) -> Option<f64>| either(f).unwrap_or(0.0) as f32;
-    let bend = match frame
+    let projection = match frame
         .lens
         .camera_model
         .as_deref()
@@ -281,7 +281,7 @@ fn posed(
         },
         raw_pose: RawPose::Matrix(matrix),
         distortion: Distortion {
-            projection: bend,
+            projection,
             k1: coefficient(|l| l.k1),
             k2: coefficient(|l| l.k2),
             k3: coefficient(|l| l.k3),
@@ -319,7 +319,7 @@ mod tests {
     use image::RgbImage;
 
     #[test]
-    fn instant_ngps_fisheyes_and_names_like_numbers_are_read() {
+    fn is_fisheye_and_file_names_that_contain_nan_are_read() {
         let dir = tempfile::tempdir().expect("a folder");
         let name = "Infinity \"NaN\".png";
         crate::image_io::save_png(&dir.path().join("images").join(name), RgbImage::new(8, 6))

@@ -261,6 +261,8 @@ fn check_size(path: &Path, width: u32, height: u32) -> Result<()> {
     ))
 }
 
+/// Reads the masks of COCO annotations. Their size is that of the run lengths, else the size in the
+/// list of images, else that of the photo.
 fn coco<'a>(
     path: &Path,
     annotations: impl Iterator<Item = &'a Annotation> + Clone,
@@ -338,7 +340,6 @@ fn track_number(track: &Track) -> Option<u32> {
         }
         Track::Name(name) => match name.trim().parse::<i64>() {
             Ok(number) => u32::try_from(number).ok(),
-            // FNV-1a with 32 bits.
             Err(_) => Some(name.bytes().fold(0x811c_9dc5, |hash: u32, byte| {
                 (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193)
             })),
@@ -538,10 +539,12 @@ fn label_studio(path: &Path, task: &Task) -> Result<MaskList> {
 /// Decodes the run lengths of Label Studio's brush and returns the alpha channel; `None` if the
 /// data are damaged.
 ///
-/// The data are a bit stream with the most significant bit first: 32 bits with the number of values
-/// (RGBA), then 5 bits with the width of a value less 1. Four times 4 bits give the widths, less 1,
-/// of four kinds of lengths. In each block, one bit selects a repeated value or a list of values.
-/// Two bits select the kind of length. The length less 1 and the values follow.
+/// The data are a bit stream, most significant bit first:
+/// * 32 bits: number of values (4 for each pixel, RGBA);
+/// * 5 bits: number of bits of a value, minus 1;
+/// * 4 x 4 bits: number of bits of a length, minus 1, for each of four kinds of lengths;
+/// * blocks: 1 bit (1 if one value is repeated, 0 for a list of values), 2 bits with the kind of
+///   length, the length minus 1, and the value or values.
 fn decode_brush(rle: &[u8]) -> Option<Vec<u8>> {
     let mut at = 0;
     let mut take = |bits: usize| -> Option<u32> {

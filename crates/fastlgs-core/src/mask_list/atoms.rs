@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn what_16_bits_cannot_number_is_left_out() {
+    fn masks_that_exceed_16_bit_atoms_are_left_out() {
         let mut masks = MaskList::new(300, 300);
         masks.masks = (0..70_000u32)
             .map(|p| {

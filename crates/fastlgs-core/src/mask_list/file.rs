@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn what_others_write_is_read_and_damage_is_named() {
+    fn other_programs_files_are_read_and_errors_name_the_file() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.json");
         let load = |text: &str| {

@@ -26,7 +26,7 @@ pub(super) fn close(map: &mut LabelMap) {
         .collect();
     // Each round extends all labels by one pixel into the gaps.
     for _ in 0..2 * GAP_RADIUS {
-        let beside = |p: &usize| {
+        let neighbour_label = |p: &usize| {
             let (x, y) = (p % width, p / width);
             let near = [
                 (x > 0, p.wrapping_sub(1)),
@@ -39,7 +39,10 @@ pub(super) fn close(map: &mut LabelMap) {
                 .map(|(_, q)| map.labels[q])
                 .find(|label| *label > 0)
         };
-        let found: Vec<(usize, u16)> = gaps.iter().filter_map(|p| Some((*p, beside(p)?))).collect();
+        let found: Vec<(usize, u16)> = gaps
+            .iter()
+            .filter_map(|p| Some((*p, neighbour_label(p)?)))
+            .collect();
         found
             .into_iter()
             .for_each(|(p, label)| map.labels[p] = label);
@@ -52,7 +55,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_gap_goes_to_both_sides_and_what_is_wide_stays() {
+    fn narrow_gaps_are_split_and_wide_ones_stay_uncovered() {
         // Labels 1 and 2 with four uncovered columns between them, then eight uncovered columns.
         let column = |x: u32| match x {
             0..6 => 1,

@@ -121,7 +121,7 @@ impl MaskList {
 
     /// Yields the row-major indices of a mask's pixels.
     pub fn pixel_indices(&self, mask: &Mask) -> impl Iterator<Item = usize> {
-        mask.runs.places(self.width, self.height)
+        mask.runs.pixel_indices(self.width, self.height)
     }
 
     /// Returns the number of masks of a level.

@@ -92,7 +92,7 @@ impl RunLengths {
     }
 
     /// Yields the row-major indices of the mask's pixels, in column-major order.
-    pub fn places(&self, width: u32, height: u32) -> impl Iterator<Item = usize> {
+    pub fn pixel_indices(&self, width: u32, height: u32) -> impl Iterator<Item = usize> {
         let mut start = 0;
         self.0.iter().enumerate().flat_map(move |(k, &length)| {
             let run = start..start + length;
@@ -114,7 +114,7 @@ mod tests {
         let mask = RunLengths::from_fn(3, 2, |x, y| x == 2 || (x, y) == (1, 0));
         assert_eq!(mask.0, [2, 1, 1, 2]);
         assert_eq!(
-            (mask.area(), mask.places(3, 2).collect::<Vec<_>>()),
+            (mask.area(), mask.pixel_indices(3, 2).collect::<Vec<_>>()),
             (3, vec![1, 2, 5])
         );
         assert_eq!(RunLengths::from_fn(2, 1, |_, _| true).0, [0, 2]);

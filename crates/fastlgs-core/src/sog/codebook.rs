@@ -18,12 +18,12 @@ pub fn codebook(values: impl Iterator<Item = f32>) -> [f32; CODES] {
     // entries too.
     let (low, high) = (sorted[0], sorted[n - 1]);
     let evenly = |k: usize| low + (high - low) * (k as f32 + 0.5) / (CODES / 2) as f32;
-    let often = |k: usize| sorted[(2 * k + 1) * n / CODES];
+    let quantile = |k: usize| sorted[(2 * k + 1) * n / CODES];
     let mut codes: [f32; CODES] = std::array::from_fn(|k| {
         if k % 2 == 0 {
             evenly(k / 2)
         } else {
-            often(k / 2)
+            quantile(k / 2)
         }
     });
     codes.sort_unstable_by(f32::total_cmp);
@@ -67,7 +67,7 @@ mod tests {
     use crate::rng::Rng;
 
     #[test]
-    fn a_codebook_is_near_all_that_it_was_made_of() {
+    fn codebook_approximates_all_input_values() {
         let mut rng = Rng::new(3, "codebook");
         let mut values: Vec<f32> = (0..20_000).map(|_| rng.normal()).collect();
         values.extend([9.0, -12.0]);

@@ -4,9 +4,9 @@
 //! A file is an archive of lossless WebP images, in which each pixel is a Gaussian, and
 //! `meta.json`, which describes them. The format has no features or object ids.
 //!
-//! Positions are logarithmic with 16 bits. Rotations are the three smallest components with 8 bits
-//! each. Scales and colours are indices into codebooks, and the SH coefficients of a Gaussian are a
-//! row of a palette. The axes are those of 3DGS PLY files.
+//! Positions are stored as sign(v) ln(|v| + 1) with 16 bits, and rotations as their three smallest
+//! components with 8 bits each. Scales and colours are indices into codebooks, and the SH
+//! coefficients of a Gaussian are a row of a palette. The axes are those of 3DGS PLY files.
 
 mod codebook;
 mod palette;
@@ -93,6 +93,7 @@ fn signed_log(v: Vec3) -> Vec3 {
     (v.abs() + 1.0).map(f32::ln) * v.signum()
 }
 
+/// Inverts [`signed_log`].
 fn signed_exp(v: Vec3) -> Vec3 {
     (v.abs().map(f32::exp) - 1.0) * v.signum()
 }
@@ -272,6 +273,7 @@ fn packed_rotation(q: [f32; 4]) -> [u8; 4] {
     [next(), next(), next(), ROTATION_TAG_W + largest as u8]
 }
 
+/// Unpacks a quaternion (w, x, y, z); `None` for an invalid tag.
 fn rotation([a, b, c, tag]: [u8; 4]) -> Option<[f32; 4]> {
     let largest = usize::from(tag.checked_sub(ROTATION_TAG_W)?);
     let rest =
@@ -508,10 +510,10 @@ mod tests {
         let mut more = data;
         more[count..count + 10].copy_from_slice(b"\"count\":99");
         std::fs::write(&path, &more).unwrap();
-        let said = read(&path).unwrap_err().to_string();
+        let message = read(&path).unwrap_err().to_string();
         assert!(
-            said.contains("damaged") || said.contains("too few"),
-            "{said}"
+            message.contains("damaged") || message.contains("too few"),
+            "{message}"
         );
     }
 }

@@ -2,11 +2,11 @@
 
 use rayon::prelude::*;
 
-/// Largest palette, in rows. The format allows 65,536, but time grows with palette rows times scene
-/// rows.
+/// Largest palette, in rows. The format allows 65,536, but the time is proportional to palette rows
+/// times input rows.
 const MAX_ROWS: usize = 4096;
-/// Scene rows per palette row. In small scenes a longer palette would be most of the file; four
-/// times the rows gain only 2.7 dB over 47 dB.
+/// Input rows per palette row. A longer palette would dominate the file of a small scene. Four
+/// times as many rows raise the PSNR of 47 dB by only 2.7 dB.
 const INPUT_ROWS_PER_ROW: usize = 16;
 /// Number of rows that train the palette; the others are only assigned to it.
 const TRAINING_ROWS: usize = 65_536;
@@ -145,7 +145,7 @@ mod tests {
     use crate::rng::Rng;
 
     #[test]
-    fn rows_of_a_few_kinds_are_told_apart() {
+    fn palette_separates_clusters_of_rows() {
         let mut rng = Rng::new(5, "palette");
         let kinds: Vec<[f32; 9]> = (0..20)
             .map(|_| std::array::from_fn(|_| rng.normal()))

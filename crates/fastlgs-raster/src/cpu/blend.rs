@@ -16,7 +16,7 @@ pub(crate) fn pixels_of(tile: u32, view: &View) -> impl Iterator<Item = (u32, u3
 }
 
 /// Returns 1 for pixels of the image and 0 for pixels of the padding.
-pub(crate) fn shown(x: u32, y: u32, view: &View) -> f32 {
+pub(crate) fn inside_image(x: u32, y: u32, view: &View) -> f32 {
     if x < view.size[0] && y < view.size[1] {
         1.0
     } else {
@@ -44,7 +44,7 @@ pub fn blend(
             let pairs = &sorted_pairs
                 [ranges[2 * tile as usize] as usize..ranges[2 * tile as usize + 1] as usize];
             let mut pixels: Vec<_> = pixels_of(tile, view)
-                .map(|(x, y)| ((x, y), shown(x, y, view), [0.0f32; 6]))
+                .map(|(x, y)| ((x, y), inside_image(x, y, view), [0.0f32; 6]))
                 .collect();
             let mut walked = 0;
             for batch in pairs.chunks(BATCH) {
@@ -76,7 +76,8 @@ pub fn blend(
                 }
             }
             let finished = |((x, y), t, sums): ((u32, u32), f32, [f32; 6])| {
-                let value = |c: usize| shown(x, y, view) * (sums[c] + t * background[c / 3][c % 3]);
+                let value =
+                    |c: usize| inside_image(x, y, view) * (sums[c] + t * background[c / 3][c % 3]);
                 (
                     view.index_of(x, y),
                     [

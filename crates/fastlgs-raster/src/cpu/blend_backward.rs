@@ -1,6 +1,7 @@
-//! CPU twin of `shaders/blend_backward.wgsl`: gradients of blending (docs/how-it-works.md, section 5.1).
+//! CPU twin of `shaders/blend_backward.wgsl`: gradients of blending (docs/how-it-works.md, section
+//! 5.1).
 
-use super::blend::{pixels_of, shown};
+use super::blend::{inside_image, pixels_of};
 use super::{Splat, alpha};
 use crate::View;
 use crate::channels::Channels;
@@ -58,7 +59,7 @@ pub fn blend_backward(
                     (
                         x as f32 + 0.5,
                         y as f32 + 0.5,
-                        shown(x, y, view),
+                        inside_image(x, y, view),
                         r_dot_g,
                         g,
                     )

@@ -1,6 +1,6 @@
 //! CPU twin of `shaders/blend_ids.wgsl`: blending weights summed by object id.
 
-use super::{BATCH, Splat, alpha, pixels_of, shown};
+use super::{BATCH, Splat, alpha, inside_image, pixels_of};
 use crate::View;
 use fastlgs_core::id_weights::{IDS_PER_PIXEL, pack};
 use rayon::prelude::*;
@@ -43,7 +43,13 @@ pub fn blend_ids(
             let pairs = &sorted_pairs
                 [ranges[2 * tile as usize] as usize..ranges[2 * tile as usize + 1] as usize];
             let mut pixels: Vec<_> = pixels_of(tile, view)
-                .map(|(x, y)| ((x, y), shown(x, y, view), [(NO_ID, 0.0); IDS_PER_PIXEL]))
+                .map(|(x, y)| {
+                    (
+                        (x, y),
+                        inside_image(x, y, view),
+                        [(NO_ID, 0.0); IDS_PER_PIXEL],
+                    )
+                })
                 .collect();
             for batch in pairs.chunks(BATCH) {
                 for &e in batch {

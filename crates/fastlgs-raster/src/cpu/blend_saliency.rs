@@ -1,6 +1,6 @@
 //! CPU twin of `shaders/blend_saliency.wgsl`: how much pixels change without a Gaussian.
 
-use super::{BATCH, Splat, alpha, pixels_of, shown};
+use super::{BATCH, Splat, alpha, inside_image, pixels_of};
 use crate::View;
 
 /// Sums the squared changes of a tile's colours without each of its Gaussians. `frame` is the
@@ -24,7 +24,7 @@ pub fn blend_saliency(
             .map(|(x, y)| {
                 let at = view.index_of(x, y);
                 let behind: [f32; 3] = std::array::from_fn(|c| frame[c * n + at]);
-                ((x, y), at, shown(x, y, view), behind)
+                ((x, y), at, inside_image(x, y, view), behind)
             })
             .collect();
         for batch in sorted_pairs[range].chunks(BATCH) {

@@ -1,6 +1,6 @@
 //! CPU twin of `shaders/blend_votes.wgsl`: blending weights summed by label.
 
-use super::{BATCH, Splat, alpha, pixels_of, shown};
+use super::{BATCH, Splat, alpha, inside_image, pixels_of};
 use crate::View;
 
 /// Sums the blending weights of each Gaussian of a tile by label. `labels` `[tile][64]` holds the
@@ -29,7 +29,7 @@ pub fn blend_votes(
         let mut sums = votes[first as usize..].chunks_exact_mut(count);
         let mut pixels: Vec<_> = pixels_of(tile, view)
             .zip(&labels[64 * at..])
-            .map(|((x, y), label)| ((x, y), *label as usize, shown(x, y, view)))
+            .map(|((x, y), label)| ((x, y), *label as usize, inside_image(x, y, view)))
             .collect();
         for batch in pairs.chunks(BATCH) {
             for (&e, sums) in batch.iter().zip(&mut sums) {

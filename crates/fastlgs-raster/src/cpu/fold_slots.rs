@@ -3,8 +3,8 @@
 use crate::View;
 use crate::channels::Channels;
 
-/// Adds up the slots of each Gaussian within runs of `view.fold` pairs, into its first slot of the
-/// run. `slots` holds 12 floats for each pair of the window, or 4 with frozen geometry.
+/// Adds up the slots of each Gaussian within runs of `view.fold_length` pairs, into its first slot
+/// of the run. `slots` holds 12 floats for each pair of the window, or 4 with frozen geometry.
 pub fn fold_slots(
     view: &View,
     channels: Channels,

@@ -2,8 +2,12 @@
 
 use crate::view::TILE;
 
-/// Ellipse on which alpha equals `ALPHA_MIN`: (mean.xy, lean, spread) (half height^2, apex, first
-/// tile row, end tile row).
+/// Ellipse on which alpha equals `ALPHA_MIN`, in pixels: (mean.xy, lean, spread) (squared half
+/// height, apex, first tile row, end tile row).
+///
+/// lean is cov_xy / cov_yy: the shift in x of the ellipse's middle for each pixel in y. spread is
+/// det / cov_yy^2: the squared half width in a row, divided by (half height^2 - dy^2). apex is the
+/// y offset of the rightmost point from the mean; the leftmost point is at -apex.
 pub type Footprint = [[f32; 4]; 2];
 
 /// Returns the columns of a row of tiles that the ellipse touches.

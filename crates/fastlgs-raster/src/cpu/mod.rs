@@ -35,7 +35,7 @@ mod tile_ranges;
 pub use adam::adam;
 pub(crate) use adam::{adam_step, opacity_penalty};
 pub use blend::blend;
-pub(crate) use blend::{BATCH, pixels_of, shown};
+pub(crate) use blend::{BATCH, inside_image, pixels_of};
 pub use blend_backward::blend_backward;
 pub use blend_ids::blend_ids;
 pub use blend_saliency::blend_saliency;
@@ -70,12 +70,18 @@ pub const ROWS_PER_INVOCATION: usize = 8;
 /// A projected Gaussian as blending reads it; layout in `shaders/project.wgsl`.
 pub type Splat = [[f32; 4]; 3];
 
+/// Smallest alpha that is drawn at a pixel: one grey level.
 pub(crate) const ALPHA_MIN: f32 = 1.0 / 255.0;
+/// Largest alpha.
 pub(crate) const ALPHA_MAX: f32 = 0.99;
+/// Opacity of a transparent Gaussian if `View::solid` is 1.
 pub(crate) const SOLID_OPACITY: f32 = 0.9;
 /// log2 of `ALPHA_MAX`: the upper bound of the exponent.
 pub(crate) const LOG2_ALPHA_MAX: f32 = -0.014_499_57;
+/// Variance in px^2 added to each projected Gaussian, so that none falls between pixels (3DGS).
 pub(crate) const DILATION: f32 = 0.3;
+/// Smallest depth of a drawn Gaussian, in units of the length of its three scales;
+/// `shaders/shared/view.wgsl` gives the reason.
 pub(crate) const NEAR: f32 = 0.5;
 
 /// Returns the index ranges of a job's chunks, in order; `shaders/shared/chunks.wgsl`.
@@ -109,6 +115,8 @@ struct Compared {
     weight: f32,
 }
 
+/// Returns the rendered value (with exposure applied) and the target of pixel (i, j). A pixel that
+/// the loss ignores has y = x.
 fn sample(plane: &Plane, frame: &[f32], targets: &[u32], i: usize, j: usize) -> Compared {
     let at = (j * 4 * plane.quads as usize) + i;
     let size = (4 * plane.quads * plane.rows) as usize;

@@ -12,6 +12,7 @@ use glam::{Mat4, UVec3, Vec2, Vec3};
 #[derive(Clone, Copy)]
 pub(crate) struct Projected {
     pub splat: Splat,
+    /// 24-bit key, ascending with depth.
     pub depth: u32,
     pub footprint: Footprint,
 }
@@ -78,6 +79,8 @@ pub(crate) fn project_one(view: &View, g: u32, param: impl Fn(usize) -> f32) -> 
         return None;
     }
     let center = Vec2::from(view.focal) * t.truncate() / t.z + Vec2::from(view.centre);
+    // Squared Mahalanobis radius of the ellipse on which alpha equals ALPHA_MIN, slightly enlarged
+    // so that rounding loses no pixel.
     let reach2 = 2.002 * (opacity / ALPHA_MIN).ln() + 1e-4;
     let half_height = (reach2 * cyy).sqrt();
     let finite = det > 0.0

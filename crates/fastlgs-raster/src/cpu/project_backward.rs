@@ -69,8 +69,9 @@ fn sum_of(slots: &[f32], floats: usize, pairs: impl Iterator<Item = u32>) -> [f3
     slot
 }
 
-/// Propagates the summed slot of one Gaussian to its trained values and passes the gradients to
-/// `store_gradient(channel, gradient)`. Formulas and symbols are those of docs/how-it-works.md, 5.2 to 5.6.
+/// Propagates the summed slot of one Gaussian to its trained values, and passes each gradient to
+/// `put(channel, gradient)`. Formulas and symbols are those of docs/how-it-works.md, 5.2 to 5.6.
+///
 /// Returns the length of the gradient of the projected mean in half-image units, 0 with frozen
 /// geometry, or none if the Gaussian is not drawn.
 pub(crate) fn backward_one(
@@ -96,7 +97,7 @@ pub(crate) fn backward_one(
         return None;
     }
     let mean = param3(0);
-    // Section 6. Colour is clamped at 0 from below.
+    // Section 5.6. Colour is clamped at 0 from below.
     let positive = Vec3::new(splat[1][2], splat[1][3], splat[2][0]).cmpgt(Vec3::ZERO);
     let d_color = Vec3::select(positive, Vec3::new(slot[6], slot[7], slot[8]), Vec3::ZERO);
     put3(11, SH_C0 * d_color);
@@ -113,7 +114,7 @@ pub(crate) fn backward_one(
         d_mean_by_color = (d_direction - direction * direction.dot(d_direction)) / distance;
     }
 
-    // Section 3: the conic Q of the natural exponent, from the splat's base-2 exponent.
+    // Section 5.3: the conic Q of the natural exponent, from the splat's base-2 exponent.
     let ln2 = std::f32::consts::LN_2;
     let (q_xx, q_xy, q_yy) = (
         -2.0 * ln2 * splat[0][2],
@@ -142,7 +143,7 @@ pub(crate) fn backward_one(
     let [jw_x, jw_y] = covariance::affine(t, view);
     let (a_x, a_y) = (r.transpose() * jw_x * s, r.transpose() * jw_y * s);
     let cov = covariance::dilated(a_x, a_y);
-    // Section 2. Where opacity is clamped at ALPHA_MAX, only a gradient that lowers it passes.
+    // Section 5.2. Where opacity is clamped at ALPHA_MAX, only a gradient that lowers it passes.
     let opacity = sigmoid(param(10));
     let dets = covariance::determinants(a_x, a_y);
     let clamped = view.kept_gain() * opacity * covariance::compensation(dets, view) >= ALPHA_MAX;
@@ -158,7 +159,7 @@ pub(crate) fn backward_one(
         d_cov_xy += half * (-cov.y / det - q_xy);
         d_cov_yy += half * (xx / det - q_yy);
     }
-    // Section 4: cov = A A^T + dilation, A = (J W) M, M = R S.
+    // Section 5.4: cov = A A^T + dilation, A = (J W) M, M = R S.
     let (d_a_x, d_a_y) = (
         2.0 * (d_cov_xx * a_x + d_cov_xy * a_y),
         2.0 * (d_cov_xy * a_x + d_cov_yy * a_y),
@@ -190,7 +191,7 @@ pub(crate) fn backward_one(
     let d_rotation = (d_unit - unit * unit.dot(d_unit)) / length;
 
     let m = [r.col(0) * s.x, r.col(1) * s.y, r.col(2) * s.z];
-    // Section 5: the mean, through the projected centre and through J.
+    // Section 5.5: the mean, through the projected centre and through J.
     let d_jw_x = m[0] * d_a_x.x + m[1] * d_a_x.y + m[2] * d_a_x.z;
     let d_jw_y = m[0] * d_a_y.x + m[1] * d_a_y.y + m[2] * d_a_y.z;
     let world = covariance::world_to_camera_rotation(view);

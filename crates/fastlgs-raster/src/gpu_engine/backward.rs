@@ -66,7 +66,7 @@ impl Slots {
             .step_by(window)
             .map(|first| first as u32)
             .collect();
-        let last = *firsts.last().expect("pairs > most");
+        let last = *firsts.last().expect("there are more pairs than slots");
         let windows = firsts
             .iter()
             .map(|&f| {

@@ -14,7 +14,7 @@ use crate::{Error, Gpu, Result};
 use std::collections::HashMap;
 use wgpu::Buffer;
 
-/// Bytes from which no more tile lists are cached for feature training.
+/// Total size in bytes from which no further tile lists are cached for feature training.
 const CACHE_LIMIT: u64 = 1 << 30;
 
 /// Tile lists that blending reads. Buffers are handles, so clones are cheap.

@@ -52,7 +52,8 @@ impl Loss {
     /// fits.
     pub fn fitting(known: Option<Self>, gpu: &Gpu, view: &View, planes: usize) -> Result<Self> {
         let pixels = view.padded_pixels() as u64;
-        // Hardware adapters have room for all planes; the cache of a software adapter has not.
+        // A hardware adapter processes all planes at once. The cache of a software adapter holds
+        // one.
         let rows = 16 * pixels;
         let at_once = if gpu.shape == Shape::Wide {
             1

@@ -12,8 +12,8 @@ use wgpu::Buffer;
 /// Number of values of an 8-bit digit.
 const DIGITS: u32 = 256;
 
-/// Double buffers of a radix sort, and the positions of its digits by chunk. Keys are written to
-/// `keys[0]`.
+/// Double buffers of a radix sort, and its histogram `[digit][chunk]`. The caller writes the keys
+/// to `keys[0]`.
 pub struct Sort {
     pub keys: [Buffer; 2],
     pub values: [Buffer; 2],

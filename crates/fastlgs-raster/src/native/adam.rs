@@ -29,12 +29,12 @@ pub fn update_block(step: &Step, width: usize, rates: &[f32], values: Values) {
         gradients,
     } = values;
     let trained = step.first_channel as usize..(step.end_channel as usize).min(width);
-    let mut penalised = [0.0; BLOCK * MAX_CHANNELS];
-    let priced = &mut penalised[..params.len()];
-    priced.copy_from_slice(gradients);
+    let mut gradient_buffer = [0.0; BLOCK * MAX_CHANNELS];
+    let penalised_gradients = &mut gradient_buffer[..params.len()];
+    penalised_gradients.copy_from_slice(gradients);
     for (row, gradients) in params
         .chunks_exact(width)
-        .zip(priced.chunks_exact_mut(width))
+        .zip(penalised_gradients.chunks_exact_mut(width))
     {
         if trained.contains(&OPACITY) {
             gradients[OPACITY] += opacity_penalty(step, row[OPACITY]);
@@ -44,7 +44,7 @@ pub fn update_block(step: &Step, width: usize, rates: &[f32], values: Values) {
         adam(
             step,
             &rates[..params.len()],
-            priced,
+            penalised_gradients,
             params,
             moment1,
             moment2,
@@ -60,7 +60,7 @@ pub fn update_block(step: &Step, width: usize, rates: &[f32], values: Values) {
             adam(
                 step,
                 &rates[own.clone()],
-                &priced[own],
+                &penalised_gradients[own],
                 params,
                 moment1,
                 moment2,

@@ -72,7 +72,7 @@ pub struct Job<'a> {
     band: &'a Band,
     lists: &'a Lists,
     /// Transmittance below which a pixel needs no more Gaussians.
-    finished: f32,
+    min_transmittance: f32,
 }
 
 impl<'a> Job<'a> {
@@ -86,7 +86,7 @@ impl<'a> Job<'a> {
             list: band.tile(column),
             band,
             lists,
-            finished: view.min_transmittance,
+            min_transmittance: view.min_transmittance,
         }
     }
 
@@ -189,7 +189,7 @@ impl<'a, V: Vector> TileSplat<'a, V> {
 /// Returns whether all pixels are below the transmittance limit.
 #[inline(always)]
 fn finished(job: &Job<'_>, transmittance: &Tile) -> bool {
-    transmittance.iter().all(|t| *t < job.finished)
+    transmittance.iter().all(|t| *t < job.min_transmittance)
 }
 
 /// Returns the blending weights for these alphas and subtracts them from the transmittance.
@@ -294,7 +294,7 @@ fn by_mask_body<V: Vector>(
                 absorb(placed.alphas(placed.dy(p)), &mut transmittance[p..])
                     .store(&mut weights[p..]);
             }
-            // `V::sums` reduces SUMS vectors at a time.
+            // `V::lane_sums` reduces `SLOT_FLOATS` vectors at a time.
             for masks in masks.chunks(SLOT_FLOATS) {
                 let mut inside = [V::splat(0.0); SLOT_FLOATS];
                 for (sum, mask) in inside.iter_mut().zip(masks) {
@@ -314,8 +314,8 @@ fn by_mask_body<V: Vector>(
 dispatched! {
     /// Measures how much the pixels of a tile change without each Gaussian: the sum of squared
     /// colour differences, each difference times `brightness`. `changes` has one value for each
-    /// Gaussian of the list, up to where the tile is finished. On entry `remaining` holds the tile's
-    /// colours including the background.
+    /// Gaussian of the list, up to where the tile is finished. On entry `behind` holds the tile's
+    /// colours including the background; each Gaussian is then subtracted from it.
     fn by_change(job: &Job<'_>, brightness: &[Tile; 3], behind: &mut [Tile; 3], transmittance: &mut Tile, changes: &mut Vec<f32>)
         = by_change_body
 }
@@ -369,7 +369,7 @@ pub struct BackwardInput {
     pub r_dot_g: Tile,
     /// On entry 1 in the image and 0 in the padding.
     pub transmittance: Tile,
-    /// Number of pairs that the forward pass processes.
+    /// Number of pairs that the forward pass processed.
     pub walked: u32,
 }
 
@@ -382,11 +382,11 @@ dispatched! {
 #[inline(always)]
 fn backward_body<V: Vector, const COLOR: bool, const FEATURE: bool, const MOVES: bool>(
     job: &Job<'_>,
-    given: &mut BackwardInput,
+    input: &mut BackwardInput,
     slots: &mut [[f32; SLOT_FLOATS]],
 ) {
     let (zero, one) = (V::splat(0.0), V::splat(1.0));
-    for &place in &job.list[..given.walked as usize] {
+    for &place in &job.list[..input.walked as usize] {
         let placed = TileSplat::<V>::new(job, job.band.gaussians[place as usize] as usize);
         let values = placed.values();
         let [mut p_sum, mut py_sum, mut pyy_sum] = [zero; 3];
@@ -394,8 +394,8 @@ fn backward_body<V: Vector, const COLOR: bool, const FEATURE: bool, const MOVES:
         for at in placed.pixels.clone() {
             let dy = placed.dy(at);
             let alpha = placed.alphas(dy);
-            let w = absorb(alpha, &mut given.transmittance[at..]);
-            let gradient = |c: usize| V::load(&given.gradient[c][at..]);
+            let w = absorb(alpha, &mut input.transmittance[at..]);
+            let gradient = |c: usize| V::load(&input.gradient[c][at..]);
             for c in channels::<COLOR, FEATURE>() {
                 sums[c] = w.madd(gradient(c), sums[c]);
             }
@@ -404,7 +404,7 @@ fn backward_body<V: Vector, const COLOR: bool, const FEATURE: bool, const MOVES:
                 for c in 0..if MOVES { 6 } else { 3 } {
                     c_dot_g = values[c].madd(gradient(c), c_dot_g);
                 }
-                let behind = &mut given.r_dot_g[at..];
+                let behind = &mut input.r_dot_g[at..];
                 let w_c_dot_g = w.mul(c_dot_g);
                 let r_dot_g = V::load(behind).sub(w_c_dot_g);
                 r_dot_g.store(behind);
@@ -446,7 +446,12 @@ mod tests {
     use crate::tests::{camera, cloud};
 
     /// Runs all bodies with vectors of one width and concatenates their results.
-    fn by<V: Vector>(view: &View, lists: &Lists, ids: &[u16], masks: &[Tile]) -> Vec<f32> {
+    fn run_all_bodies<V: Vector>(
+        view: &View,
+        lists: &Lists,
+        ids: &[u16],
+        masks: &[Tile],
+    ) -> Vec<f32> {
         let mut out = Vec::new();
         for tile in 0..(view.tiles[0] * view.tiles[1]) as usize {
             let job = Job::new(view, tile, lists);
@@ -488,12 +493,12 @@ mod tests {
     }
 
     #[test]
-    fn the_bound_of_the_exponent_is_that_of_alpha() {
+    fn log2_alpha_max_matches_alpha_max() {
         assert!((LOG2_ALPHA_MAX.exp2() - crate::cpu::ALPHA_MAX).abs() < 2e-7);
     }
 
     #[test]
-    fn vectors_of_sixteen_give_what_those_of_eight_do() {
+    fn results_do_not_depend_on_the_vector_width() {
         let scene = cloud(3000, 4, 1, true);
         let state = State::of(&scene);
         // Neither image side is a multiple of the tile edge.
@@ -504,8 +509,8 @@ mod tests {
             .map(|k| std::array::from_fn(|p| f32::from(u8::from(p % (k + 2) == 0))))
             .collect();
         let (eight, sixteen) = (
-            by::<Portable<8>>(&view, &lists, &ids, &masks),
-            by::<Portable<16>>(&view, &lists, &ids, &masks),
+            run_all_bodies::<Portable<8>>(&view, &lists, &ids, &masks),
+            run_all_bodies::<Portable<16>>(&view, &lists, &ids, &masks),
         );
         assert_eq!(eight.len(), sixteen.len());
         assert!(eight.iter().filter(|v| **v != 0.0).count() > eight.len() / 4);

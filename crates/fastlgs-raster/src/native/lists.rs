@@ -15,7 +15,7 @@ pub(crate) struct Lists {
     pub bands: Vec<Band>,
     /// Positions of each Gaussian in the concatenated `gaussians` of all bands. Those of Gaussian
     /// `g` are `positions[first[g]..first[g + 1]]`.
-    pub places: Vec<u32>,
+    pub positions: Vec<u32>,
     /// Start of each Gaussian's range in `positions`, and the end of the last range.
     pub first: Vec<u32>,
 }
@@ -49,7 +49,7 @@ impl Lists {
     pub fn new(view: &View, params: &[f32]) -> Self {
         let projected = project(view, params);
         let bands = bands(view, &projected);
-        let (first, places) = positions(&bands, projected.len());
+        let (first, positions) = positions(&bands, projected.len());
         let reach = projected
             .par_iter()
             .map(|p| p.footprint[1][0].sqrt() + ROUNDING)
@@ -58,7 +58,7 @@ impl Lists {
             splats: splats(&projected),
             reach,
             bands,
-            places,
+            positions,
             first,
         }
     }
@@ -74,13 +74,13 @@ impl Lists {
         let words = |band: &Band| band.gaussians.len() + band.pairs.len() + band.ends.len();
         let words: usize = self.bands.iter().map(words).sum();
         size_of_val(self.splats.as_slice())
-            + 4 * (words + self.reach.len() + self.places.len() + self.first.len())
+            + 4 * (words + self.reach.len() + self.positions.len() + self.first.len())
     }
 
-    /// Returns the places of a Gaussian, or an empty slice beyond the last Gaussian.
-    pub fn places_of(&self, gaussian: usize) -> &[u32] {
+    /// Returns the positions of a Gaussian, or an empty slice beyond the last Gaussian.
+    pub fn positions_of(&self, gaussian: usize) -> &[u32] {
         match self.first.get(gaussian..gaussian + 2) {
-            Some([first, end]) => &self.places[*first as usize..*end as usize],
+            Some([first, end]) => &self.positions[*first as usize..*end as usize],
             _ => &[],
         }
     }
@@ -322,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_of_tiles_hold_what_touches_them() {
+    fn tile_lists_contain_exactly_the_gaussians_that_touch_the_tile() {
         // 19 rows of tiles. The ellipses cover from less than one row to more than all rows.
         let view = View::new(&crate::tests::camera(90, 150), 4, 0);
         let round = |x: f32, y: f32, r: f32| {

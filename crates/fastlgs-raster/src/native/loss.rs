@@ -58,12 +58,12 @@ fn taps<'a>(
     line: usize,
     j: usize,
 ) -> (Window, [&'a [f32]; 2 * SSIM_RADIUS + 1]) {
-    let held = |k: usize| {
+    let row_at = |k: usize| {
         (j + k)
             .checked_sub(SSIM_RADIUS)
             .and_then(|row| rows.get(row * line..(row + 1) * line))
     };
-    let taps: [_; 2 * SSIM_RADIUS + 1] = std::array::from_fn(held);
+    let taps: [_; 2 * SSIM_RADIUS + 1] = std::array::from_fn(row_at);
     let own = &rows[j * line..(j + 1) * line];
     (
         std::array::from_fn(|k| taps[k].map_or(0.0, |_| window[k])),
@@ -318,7 +318,7 @@ fn derivatives_body<const FMA: bool>(moments: &[f32], out: &mut [f32], sum: &mut
             by[0][i] = 2.0 * my[i] * (b - a) * inverse - 2.0 * mx[i] * ssim * (d - c) * inverse;
             by[1][i] = -ssim * (c * inverse);
             by[2][i] = 2.0 * a * inverse;
-            // Lanes beyond the row compare zeros and must not count.
+            // Lanes beyond the row compare zeros, so they are left out of the sum.
             sums[i] += if first + i < w { ssim } else { 0.0 };
         }
         [&mut *by_mean, by_square, by_product]

@@ -49,8 +49,8 @@ pub struct CpuEngine {
     gradient: TiledPlanes<6>,
     scratch: loss::Scratch,
     processed: Vec<u32>,
-    /// Gradient sums of a Gaussian over the tiles of one row. [`Lists::places`] holds indices into
-    /// it.
+    /// Gradient sums of a Gaussian over the tiles of one row. [`Lists::positions`] holds indices
+    /// into it.
     slots: Vec<[f32; SLOT_FLOATS]>,
     lists: Option<Lists>,
     /// Tile lists by target id, kept while geometry is frozen.
@@ -68,7 +68,8 @@ pub(crate) fn transposed(columns: &[f32], n: usize) -> Vec<f32> {
         .collect()
 }
 
-/// Returns the `IDS_PER_PIXEL` ids with the largest weights as packed id weights, in descending order.
+/// Returns the `IDS_PER_PIXEL` ids with the largest weights as packed id weights, in descending
+/// order.
 fn heaviest(weights: impl Iterator<Item = (u16, f32)>) -> [u32; IDS_PER_PIXEL] {
     let mut best = [(0, 0.0); IDS_PER_PIXEL];
     for (id, weight) in weights {
@@ -88,10 +89,10 @@ fn blended<const COLOR: bool, const FEATURE: bool>(
     tile: usize,
 ) -> Blended {
     let job = Job::new(view, tile, lists);
-    let shown = blend::inside_image(view, &job);
+    let inside = blend::inside_image(view, &job);
     let mut out = Blended {
         sums: [blend::EMPTY; 6],
-        transmittance: shown,
+        transmittance: inside,
         walked: 0,
     };
     blend::forward::<COLOR, FEATURE>(&job, &mut out);
@@ -107,7 +108,7 @@ fn blended<const COLOR: bool, const FEATURE: bool>(
         .filter(|(_, asked)| *asked)
     {
         for (p, sum) in sums.iter_mut().enumerate() {
-            *sum = shown[p] * (*sum + out.transmittance[p] * background);
+            *sum = inside[p] * (*sum + out.transmittance[p] * background);
         }
     }
     out
@@ -194,7 +195,7 @@ impl CpuEngine {
         view: &View,
     ) {
         let lists = self.lists.as_ref().expect("made by the forward pass");
-        self.slots.resize(lists.places.len(), [0.0; SLOT_FLOATS]);
+        self.slots.resize(lists.positions.len(), [0.0; SLOT_FLOATS]);
         let tiles_x = view.tiles[0] as usize;
         // Each row of tiles owns a contiguous range of the slots.
         let mut bands = Vec::new();
@@ -224,13 +225,13 @@ impl CpuEngine {
                         *b += l * g;
                     }
                 }
-                let mut given = BackwardInput {
+                let mut input = BackwardInput {
                     gradient: g,
                     r_dot_g,
                     transmittance: blend::inside_image(view, &job),
                     walked: walked[tile],
                 };
-                blend::backward::<COLOR, FEATURE, MOVES>(&job, &mut given, slots);
+                blend::backward::<COLOR, FEATURE, MOVES>(&job, &mut input, slots);
             }
         });
     }
@@ -261,9 +262,9 @@ impl CpuEngine {
                     .enumerate()
                 {
                     let i = block * adam::BLOCK + k;
-                    let places = lists.places_of(i);
+                    let places = lists.positions_of(i);
                     lists
-                        .places_of(i + AHEAD)
+                        .positions_of(i + AHEAD)
                         .iter()
                         .for_each(|place| simd::prefetch(&slots[*place as usize]));
                     let mut slot = [0.0; SLOT_FLOATS];
@@ -518,7 +519,7 @@ impl Engine for CpuEngine {
 
     fn memory(&self) -> Memory {
         let bytes = |words: usize| 4 * words as u64;
-        let words = |lists: &Lists| lists.pairs() + 2 * lists.places.len();
+        let words = |lists: &Lists| lists.pairs() + 2 * lists.positions.len();
         Memory {
             state: bytes(3 * self.params.len()),
             lists: bytes(self.lists.as_ref().map_or(0, words) + SLOT_FLOATS * self.slots.len()),

@@ -493,7 +493,7 @@ mod tests {
     }
 
     #[test]
-    fn vectors_do_what_their_floats_do() {
+    fn vector_arithmetic_equals_scalar_arithmetic() {
         let mut checked = 0;
         check_body::<Portable<8>>(&mut checked);
         check_body::<Portable<16>>(&mut checked);

@@ -33,7 +33,7 @@ fn pixel_distance(a: &Camera, b: &Camera) -> f32 {
 }
 
 #[test]
-fn a_camera_is_found_again() {
+fn align_restores_a_displaced_camera() {
     let scene = cloud(3000, 3, 1, false);
     let mut engine = CpuEngine::new();
     engine.set_state(&State::of(&scene)).unwrap();
@@ -78,7 +78,7 @@ fn a_camera_is_found_again() {
 }
 
 #[test]
-fn all_together_cameras_stay() {
+fn a_common_motion_of_all_cameras_is_undone() {
     let mut rng = Rng::new(2, "poses");
     let eye = |k: usize| 4.0 * Vec3::new((0.3 * k as f32).sin(), 0.1, -(0.3 * k as f32).cos());
     let before: Vec<Camera> = (0..12)
@@ -95,7 +95,7 @@ fn all_together_cameras_stay() {
         .iter()
         .map(|c| displaced(&shifted(c), 0.2, &mut rng))
         .collect();
-    align::keep_mean(&before, &mut after);
+    align::restore_mean_pose(&before, &mut after);
     let mean = before
         .iter()
         .zip(&after)

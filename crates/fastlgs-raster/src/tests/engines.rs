@@ -171,7 +171,7 @@ fn gpu_and_cpu_agree_on_votes_and_saliency() {
 }
 
 #[test]
-fn many_bindings_give_what_one_gives() {
+fn several_pages_and_windows_give_the_result_of_one() {
     let scene = cloud(12_000, 5, 1, true);
     let state = State::of(&scene);
     let view = View::new(&camera(96, 64), scene.len(), 1).with_dropout(0.25, 7);
@@ -217,7 +217,7 @@ fn many_bindings_give_what_one_gives() {
 }
 
 #[test]
-fn any_number_of_first_passes_may_run_as_twins() {
+fn first_passes_can_run_as_cpu_twins() {
     let scene = cloud(300, 6, 1, false);
     let state = State::of(&scene);
     let view = View::new(&camera(40, 30), scene.len(), 1);
@@ -278,7 +278,7 @@ fn frozen_geometry_keeps_its_lists_and_learns_features() {
 }
 
 #[test]
-fn the_gpu_repeats_itself_to_the_byte() {
+fn gpu_training_repeats_the_same_bytes() {
     let scene = cloud(2000, 21, 2, false);
     let run = |gpu: crate::Gpu| {
         let mut engine = GpuEngine::new(gpu);
@@ -351,7 +351,7 @@ fn gpu_and_cpu_agree_on_objects() {
 }
 
 #[test]
-fn what_is_clear_shows_nothing_but_hides_where_it_counts_as_solid() {
+fn transparent_gaussians_are_drawn_only_if_solid_is_set() {
     let mut scene = cloud(2000, 5, 0, true);
     let plain = scene.clone();
     // A transparent pane in front of the left half of the image: four rows of spheres.
@@ -403,7 +403,7 @@ fn what_is_clear_shows_nothing_but_hides_where_it_counts_as_solid() {
 }
 
 #[test]
-fn a_step_leaves_out_its_share() {
+fn a_step_drops_the_requested_share_of_gaussians() {
     let scene = cloud(20_000, 3, 0, true);
     let view = View::new(&camera(96, 64), scene.len(), 0);
     let mut cpu = CpuEngine::new();
@@ -436,7 +436,7 @@ fn a_step_leaves_out_its_share() {
 }
 
 #[test]
-fn those_that_are_left_make_up_for_the_others() {
+fn opacity_gain_compensates_for_dropped_gaussians() {
     // Low opacities let about half of the light through.
     let mut scene = cloud(1500, 3, 0, true);
     scene.opacity_logits.fill(-1.5);

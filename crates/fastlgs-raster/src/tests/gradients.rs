@@ -324,10 +324,10 @@ fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
             .fold(0.0f32, |m, g| m.max(g.abs()));
         for k in c * n..(c + 1) * n {
             let difference = central_difference(&|delta| {
-                let mut check_surroundings = params.clone();
-                check_surroundings[k] += delta;
+                let mut shifted_params = params.clone();
+                shifted_params[k] += delta;
                 loss(
-                    &render(&view, &check_surroundings, &around),
+                    &render(&view, &shifted_params, &around),
                     &target_values,
                     &around,
                 )
@@ -340,25 +340,26 @@ fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
             );
         }
     }
-    let moved = |what_moves: &str, found: f64, change: &dyn Fn(&mut Surroundings, f64)| {
-        let difference = central_difference(&|delta| {
-            let mut around = around.clone();
-            change(&mut around, delta);
-            loss(&render(&view, &params, &around), &target_values, &around)
-        });
-        assert!(
-            (difference - found).abs() <= 2e-3 * difference.abs() + 1e-6,
-            "{what_moves}: {found} against {difference} ({what})"
-        );
-    };
+    let check_surroundings =
+        |what_moves: &str, found: f64, change: &dyn Fn(&mut Surroundings, f64)| {
+            let difference = central_difference(&|delta| {
+                let mut around = around.clone();
+                change(&mut around, delta);
+                loss(&render(&view, &params, &around), &target_values, &around)
+            });
+            assert!(
+                (difference - found).abs() <= 2e-3 * difference.abs() + 1e-6,
+                "{what_moves}: {found} against {difference} ({what})"
+            );
+        };
     for c in 0..6 {
-        moved("background", losses.by_background[c], &|a, delta| {
+        check_surroundings("background", losses.by_background[c], &|a, delta| {
             a.background[c] += delta
         });
     }
     for c in 0..3 {
-        moved("gain", losses.by_gain[c], &|a, delta| a.gain[c] += delta);
-        moved("offset", losses.by_offset[c], &|a, delta| {
+        check_surroundings("gain", losses.by_gain[c], &|a, delta| a.gain[c] += delta);
+        check_surroundings("offset", losses.by_offset[c], &|a, delta| {
             a.offset[c] += delta
         });
     }

@@ -46,8 +46,8 @@ pub(crate) fn camera(width: u32, height: u32) -> Camera {
     )
 }
 
-/// Returns a random cloud around the origin. `with_edge_cases` adds Gaussians that must not be drawn or are
-/// hard to draw.
+/// Returns a random cloud around the origin. `with_edge_cases` adds Gaussians that must not be
+/// drawn or are hard to draw.
 pub(crate) fn cloud(n: usize, seed: u64, sh_degree: u32, with_edge_cases: bool) -> Gaussians {
     let mut rng = Rng::new(seed, "cloud");
     // Larger clouds have smaller Gaussians, as trained scenes do.

@@ -420,7 +420,7 @@ fn listing() {
 }
 
 #[test]
-fn more_passes_than_uniforms_fit_a_submission() {
+fn recorder_submits_when_its_uniform_slots_are_full() {
     let Some(gpu) = gpu() else { return };
     let pass = Pass::new(&gpu, shaders::Adam::SHADER, Channels::Both, false);
     let params = page(&cloud(5, 1, 0, false).to_channels(), 5);
@@ -458,7 +458,7 @@ fn more_passes_than_uniforms_fit_a_submission() {
 }
 
 #[test]
-fn room_that_emit_leaves_over_is_nobodys() {
+fn surplus_pairs_of_emit_are_ignored() {
     let Some(mut gpu) = gpu() else { return };
     gpu.shape = Shape::Lanes;
     let l = lists(300, 64, 48, 0, false);

@@ -107,7 +107,7 @@ fn resumes_to_the_same_bytes() {
 }
 
 #[test]
-fn masks_shape_from_some_step_on_also_in_a_resumed_run() {
+fn coupling_starts_at_its_step_and_continues_in_a_resumed_run() {
     let dir = tempfile::tempdir().unwrap();
     let checkpoint = dir.path().join("train");
     let config = TrainerConfig {
@@ -154,7 +154,7 @@ fn masks_shape_from_some_step_on_also_in_a_resumed_run() {
 }
 
 #[test]
-fn what_views_look_through_stays_empty() {
+fn density_control_removes_gaussians_in_free_space() {
     let config = TrainerConfig {
         iterations: 100,
         refine_until: 0.8,
@@ -184,7 +184,7 @@ fn what_views_look_through_stays_empty() {
             .unwrap()
             .means
             .iter()
-            .filter(|mean| free.holds(**mean))
+            .filter(|mean| free.contains(**mean))
             .count()
     };
     let [unrestricted, kept_free] = [false, true].map(in_free_space);
@@ -210,7 +210,7 @@ fn density_control_keeps_the_budget() {
 }
 
 #[test]
-fn an_automatic_budget_removes_what_changes_little() {
+fn an_automatic_budget_removes_unimportant_gaussians() {
     let (_, report) = run(TrainerConfig {
         iterations: 800,
         budget: Budget::Auto(1000),
@@ -255,7 +255,7 @@ fn exposure_and_background_are_learned() {
 }
 
 #[test]
-fn nothing_to_train_is_said() {
+fn training_without_views_is_an_error() {
     let engine = Box::new(CpuEngine::new());
     let message = Trainer::new(
         engine,

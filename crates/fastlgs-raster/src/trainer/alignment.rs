@@ -10,7 +10,7 @@ use fastlgs_core::Camera;
 
 /// Alignment steps at a quarter, half and full resolution. They are few, because the next alignment
 /// continues from the result.
-const ALIGNING: [usize; 3] = [2, 1, 0];
+const ALIGNMENT_STEPS: [usize; 3] = [2, 1, 0];
 /// Smallest PSNR gain of the validation views, in dB, for which all views are aligned. With exact
 /// poses the gain is some hundredths.
 const MIN_ALIGNMENT_GAIN: f64 = 0.3;
@@ -18,31 +18,33 @@ const MIN_ALIGNMENT_GAIN: f64 = 0.3;
 impl Trainer {
     /// Returns a view's camera at the pose from which the current scene looks most like its photo.
     pub(super) fn aligned(&mut self, target: &Target, exposure: &Exposure) -> Result<Camera> {
-        let degree = self.course.config.degree(self.course.iteration);
-        let (course, gaussians) = (&self.course, self.engine.len());
+        let degree = self.training.config.degree(self.training.iteration);
+        let (course, gaussians) = (&self.training, self.engine.len());
         align::align(
             self.engine.as_mut(),
             |camera| view_of(course, gaussians, camera, degree),
             target,
             exposure,
-            ALIGNING,
+            ALIGNMENT_STEPS,
         )
     }
 
     /// Aligns the training views to the current scene, and keeps their mean pose.
     ///
-    /// With `Alignment::Auto` this happens only if the validation views gain enough, because good
-    /// poses are better left alone. Under an automatic budget these views are not trained on yet.
+    /// With `Alignment::Auto` this happens only if the validation views gain enough, so that
+    /// good poses do not change. Under an automatic budget these views are not trained on yet.
     pub(super) fn align(&mut self) -> Result<()> {
-        if self.course.alignment_gain.is_none() && self.course.config.alignment == Alignment::Auto {
-            let watched = self.watched();
+        if self.training.alignment_gain.is_none()
+            && self.training.config.alignment == Alignment::Auto
+        {
+            let watched = self.validation_views();
             if watched.is_empty() {
                 return Ok(());
             }
             let mut moved = watched.clone();
             for id in 0..watched.len() {
                 let target = watched.get(id)?;
-                moved.cameras[id] = self.aligned(&target, &self.known_exposure(&target))?;
+                moved.cameras[id] = self.aligned(&target, &self.measured_exposure(&target))?;
             }
             let gain = self
                 .quality(&moved, None)?
@@ -52,11 +54,11 @@ impl Trainer {
                 gain,
                 "PSNR gain of the validation views by alignment, in dB"
             );
-            self.course.alignment_gain = Some(gain);
+            self.training.alignment_gain = Some(gain);
         }
-        if self.course.config.alignment == Alignment::Auto
+        if self.training.config.alignment == Alignment::Auto
             && self
-                .course
+                .training
                 .alignment_gain
                 .is_some_and(|gain| gain < MIN_ALIGNMENT_GAIN)
         {
@@ -68,9 +70,9 @@ impl Trainer {
             let (target, exposure) = (self.targets.get(id)?, self.exposure(id));
             after.push(self.aligned(&target, &exposure)?);
         }
-        align::keep_mean(&before, &mut after);
+        align::restore_mean_pose(&before, &mut after);
         for (id, camera) in after.into_iter().enumerate() {
-            self.course.poses[id] = camera.world_to_camera;
+            self.training.poses[id] = camera.world_to_camera;
             self.targets.cameras[id] = camera;
         }
         Ok(())

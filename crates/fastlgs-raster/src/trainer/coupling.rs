@@ -12,15 +12,15 @@ use fastlgs_core::{Camera, Gaussians};
 impl Trainer {
     /// Returns whether the feature loss already moves geometry.
     pub fn is_coupled(&self) -> bool {
-        self.course.coupled
+        self.training.coupled
     }
 
     /// Returns the channels that the next step trains.
     pub(super) fn channels(&self) -> Channels {
-        if self.course.coupled {
+        if self.training.coupled {
             Channels::Coupled
         } else {
-            self.course.config.channels
+            self.training.config.channels
         }
     }
 
@@ -50,7 +50,7 @@ impl Trainer {
                 .for_each(|(value, feature)| *value = feature[axis]);
         }
         self.engine.set_state(&state)?;
-        self.course.coupled = true;
+        self.training.coupled = true;
         Ok(())
     }
 

@@ -1,4 +1,4 @@
-//! Target images on the device: all of them if they fit, else some are read again.
+//! Target images on the device. If they do not all fit, some are read again when they are used.
 
 use super::Trainer;
 use crate::Result;
@@ -15,10 +15,10 @@ pub(super) struct LoadedTargets {
     /// Bytes of each view's image.
     views: BTreeMap<usize, usize>,
     /// Largest number of bytes.
-    pub room: usize,
+    pub limit: usize,
     /// Seconds in which images were read. They are not counted as time of steps, which they would
     /// distort in short runs.
-    pub reading: f64,
+    pub read_seconds: f64,
 }
 
 impl Default for LoadedTargets {
@@ -26,8 +26,8 @@ impl Default for LoadedTargets {
         Self {
             coarse: false,
             views: BTreeMap::new(),
-            room: ROOM,
-            reading: 0.0,
+            limit: ROOM,
+            read_seconds: 0.0,
         }
     }
 }
@@ -35,26 +35,26 @@ impl Default for LoadedTargets {
 impl Trainer {
     /// Loads the target image of a view onto the device, at the resolution of the next step.
     pub(super) fn load_target(&mut self, id: usize) -> Result<()> {
-        let coarse = self.course.config.coarse(self.course.iteration);
-        if self.shown.coarse != coarse {
+        let coarse = self.training.config.coarse(self.training.iteration);
+        if self.loaded_targets.coarse != coarse {
             self.unload_targets();
-            self.shown.coarse = coarse;
+            self.loaded_targets.coarse = coarse;
         }
-        if !self.shown.views.contains_key(&id) {
+        if !self.loaded_targets.views.contains_key(&id) {
             let started = Instant::now();
             let image = self.targets.get(id)?.image;
             let image = if coarse { image.halved() } else { image };
             let bytes = image.bytes();
             self.engine.set_target(id, image)?;
-            self.shown.views.insert(id, bytes);
-            self.shown.reading += started.elapsed().as_secs_f64();
+            self.loaded_targets.views.insert(id, bytes);
+            self.loaded_targets.read_seconds += started.elapsed().as_secs_f64();
         }
         Ok(())
     }
 
     /// Removes all target images from the device, because they are outdated.
     pub(super) fn unload_targets(&mut self) {
-        std::mem::take(&mut self.shown.views)
+        std::mem::take(&mut self.loaded_targets.views)
             .into_keys()
             .for_each(|id| self.engine.remove_target(id));
     }
@@ -62,8 +62,8 @@ impl Trainer {
     /// Removes the image of view `id` after its step if the limit is exceeded. Each view is used
     /// once before any is used again, so no other choice causes fewer reads.
     pub(super) fn enforce_limit(&mut self, id: usize) {
-        if self.shown.views.values().sum::<usize>() > self.shown.room {
-            self.shown.views.remove(&id);
+        if self.loaded_targets.views.values().sum::<usize>() > self.loaded_targets.limit {
+            self.loaded_targets.views.remove(&id);
             self.engine.remove_target(id);
         }
     }
@@ -136,7 +136,7 @@ mod tests {
             views(reads.clone(), broken),
             config,
         )?;
-        trainer.shown.room = room.unwrap_or(trainer.shown.room);
+        trainer.loaded_targets.limit = room.unwrap_or(trainer.loaded_targets.limit);
         trainer.run(None, |_, _| Ok::<_, Error>(()))?;
         Ok((
             trainer.gaussians()?,
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn room_changes_memory_and_nothing_else() {
+    fn the_limit_of_loaded_images_does_not_change_the_result() {
         let picture = 4 * 64 * 48;
         let (all, read, held) = run(None, usize::MAX).unwrap();
         // Once for the contrast, once at half and once at full resolution.
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_that_went_missing_ends_the_run_in_words() {
+    fn a_missing_photo_ends_the_run_with_its_error() {
         let message = run(Some(0), 3 * VIEWS).unwrap_err().to_string();
         assert_eq!(message, "the photo is gone");
         assert!(

@@ -76,8 +76,8 @@ pub struct Trainer {
     contrast: f32,
     /// Space in which density control removes Gaussians.
     free_space: FreeSpace,
-    course: TrainingState,
-    shown: LoadedTargets,
+    training: TrainingState,
+    loaded_targets: LoadedTargets,
 }
 
 /// Returns the view of a camera with the options and the background of a run.
@@ -152,8 +152,8 @@ impl Trainer {
             contrast,
             free_space: FreeSpace::default(),
             targets,
-            course,
-            shown: LoadedTargets::default(),
+            training: course,
+            loaded_targets: LoadedTargets::default(),
         })
     }
 
@@ -171,31 +171,31 @@ impl Trainer {
     /// Returns the next training view: every view once in random order, then again. Under an
     /// automatic budget, validation views are left out until growth ends.
     fn next_view(&mut self) -> usize {
-        let growing = matches!(self.course.config.budget, Budget::Auto(_)) && self.grows();
-        if self.course.order.is_empty() {
+        let growing = matches!(self.training.config.budget, Budget::Auto(_)) && self.grows();
+        if self.training.order.is_empty() {
             let count = self.targets.len();
-            self.course.order = (0..count)
-                .filter(|&i| !(growing && budget::is_watched(i, count)))
+            self.training.order = (0..count)
+                .filter(|&i| !(growing && budget::is_validation_view(i, count)))
                 .collect();
-            self.course.rng.shuffle(&mut self.course.order);
+            self.training.rng.shuffle(&mut self.training.order);
         }
-        self.course.order.pop().expect("filled above")
+        self.training.order.pop().expect("filled above")
     }
 
     fn grows(&self) -> bool {
-        let config = &self.course.config;
-        config.channels.color() && config.grows(self.course.iteration)
+        let config = &self.training.config;
+        config.channels.color() && config.grows(self.training.iteration)
     }
 
     fn view(&self, camera: &Camera, sh_degree: u32) -> View {
-        view_of(&self.course, self.engine.len(), camera, sh_degree)
+        view_of(&self.training, self.engine.len(), camera, sh_degree)
     }
 
     fn step(&mut self) -> Result<()> {
         let id = self.next_view();
         self.load_target(id)?;
-        let config = self.course.config.clone();
-        let iteration = self.course.iteration;
+        let config = self.training.config.clone();
+        let iteration = self.training.iteration;
         let camera = &self.targets.cameras[id];
         let camera = if config.coarse(iteration) {
             camera.halved()
@@ -229,26 +229,26 @@ impl Trainer {
         self.enforce_limit(id);
         if config.exposure || config.learn_background {
             let losses = self.engine.losses()?;
-            if let Some(exposure) = self.course.exposures.get_mut(id) {
+            if let Some(exposure) = self.training.exposures.get_mut(id) {
                 exposure.learn(&losses, config.progress(iteration));
-                exposure::pin_mean(&mut self.course.exposures);
+                exposure::pin_mean(&mut self.training.exposures);
             }
             if config.learn_background {
                 // The background feature stays 0, because queries expect no other.
                 let [r, g, b, ..] = losses.by_background;
-                self.course
+                self.training
                     .background
                     .step([r, g, b, 0.0, 0.0, 0.0], BACKGROUND_RATE);
             }
         }
-        self.course.iteration += 1;
+        self.training.iteration += 1;
         Ok(())
     }
 
     /// Runs a round of density control.
     fn refine(&mut self) -> Result<()> {
         let mut state = self.engine.state()?;
-        let config = &self.course.config;
+        let config = &self.training.config;
         let before = state.len();
         let budget = if self.grows() {
             config.budget.max_gaussians()
@@ -264,11 +264,11 @@ impl Trainer {
             &self.engine.stats()?,
             self.extent,
             &limits,
-            &mut self.course.rng,
+            &mut self.training.rng,
         );
-        let floaters = state.remove_where(|mean| self.free_space.holds(mean));
+        let floaters = state.remove_where(|mean| self.free_space.contains(mean));
         tracing::debug!(
-            iteration = self.course.iteration,
+            iteration = self.training.iteration,
             gaussians = state.len(),
             ?counts,
             floaters,
@@ -295,7 +295,7 @@ impl Trainer {
     }
 
     fn exposure(&self, id: usize) -> Exposure {
-        self.course
+        self.training
             .exposures
             .get(id)
             .map_or_else(Exposure::default, LearnedExposure::exposure)
@@ -303,8 +303,8 @@ impl Trainer {
 
     /// Returns the exposure of a view that is not trained on, from its measured brightness. Without
     /// it, differences in brightness would hide changes of quality.
-    fn known_exposure(&self, target: &Target) -> Exposure {
-        if self.course.config.exposure {
+    fn measured_exposure(&self, target: &Target) -> Exposure {
+        if self.training.config.exposure {
             Exposure {
                 gain: target.gain,
                 ..Exposure::default()
@@ -314,19 +314,21 @@ impl Trainer {
         }
     }
 
-    /// Returns the mean PSNR in dB of the current scene on any views, over the pixels that count.
+    /// Returns the mean PSNR in dB of the current scene on any views, over the pixels that the
+    /// loss uses.
     /// Colour has SH degree `sh_degree`, or the degree in use if `None`. Returns `None` if there
-    /// are no views, or no pixel counts.
+    /// are no views, or the loss ignores all pixels.
     ///
     /// # Errors
     /// As [`Engine::render`], and when an image cannot be read.
     pub fn quality(&mut self, views: &Targets, sh_degree: Option<u32>) -> Result<Option<f64>> {
-        let degree = sh_degree.unwrap_or_else(|| self.course.config.degree(self.course.iteration));
+        let degree =
+            sh_degree.unwrap_or_else(|| self.training.config.degree(self.training.iteration));
         let mut sum = 0.0;
         let mut count = 0u32;
         for id in 0..views.len() {
             let target = views.get(id)?;
-            let (image, gain) = (&target.image, self.known_exposure(&target).gain);
+            let (image, gain) = (&target.image, self.measured_exposure(&target).gain);
             let frame = self
                 .engine
                 .render(self.view(&target.camera, degree), Channels::Color)?;
@@ -360,32 +362,32 @@ impl Trainer {
         checkpoint: Option<&Path>,
         mut report: impl FnMut(&Progress, &mut Self) -> Result<(), E>,
     ) -> Result<TrainerReport, E> {
-        let first = self.course.iteration;
+        let first = self.training.iteration;
         let mut started = Instant::now();
         // The time of `report` does not count.
         let mut report_seconds = 0.0;
-        while self.course.iteration < self.course.config.iterations {
+        while self.training.iteration < self.training.config.iterations {
             self.step()?;
-            let iteration = self.course.iteration;
+            let iteration = self.training.iteration;
             if iteration == first + 1 {
                 // Drivers compile kernels in their first dispatch.
                 self.engine.losses()?;
                 started = Instant::now();
-                self.shown.reading = 0.0;
+                self.loaded_targets.read_seconds = 0.0;
             }
-            if self.course.config.refines(iteration) {
+            if self.training.config.refines(iteration) {
                 self.refine()?;
             }
-            if self.course.config.resets_opacity(iteration) {
+            if self.training.config.resets_opacity(iteration) {
                 self.reset_opacity()?;
             }
-            if self.course.config.aligns(iteration) {
+            if self.training.config.aligns(iteration) {
                 self.align()?;
             }
-            if self.course.config.prunes(iteration) {
+            if self.training.config.prunes(iteration) {
                 self.prune()?;
             }
-            if iteration.is_multiple_of(20) || self.course.config.couples_at == Some(iteration) {
+            if iteration.is_multiple_of(20) || self.training.config.couples_at == Some(iteration) {
                 let losses = self.engine.losses()?;
                 // For normally distributed errors, mean square = pi/2 x squared mean absolute
                 // error.
@@ -393,7 +395,9 @@ impl Trainer {
                     * (losses.color_l1.powi(2) * std::f64::consts::FRAC_PI_2)
                         .max(1e-12)
                         .log10();
-                let seconds = started.elapsed().as_secs_f64() - report_seconds - self.shown.reading;
+                let seconds = started.elapsed().as_secs_f64()
+                    - report_seconds
+                    - self.loaded_targets.read_seconds;
                 let reporting = Instant::now();
                 report(
                     &Progress {
@@ -408,25 +412,25 @@ impl Trainer {
                 report_seconds += reporting.elapsed().as_secs_f64();
             }
             if let Some(path) = checkpoint.filter(|_| {
-                iteration.is_multiple_of(500) && iteration < self.course.config.iterations
+                iteration.is_multiple_of(500) && iteration < self.training.config.iterations
             }) {
                 self.save(path)?;
             }
         }
         self.engine.losses()?;
         let (seconds, steps) = (
-            started.elapsed().as_secs_f64() - report_seconds - self.shown.reading,
-            self.course.iteration - first,
+            started.elapsed().as_secs_f64() - report_seconds - self.loaded_targets.read_seconds,
+            self.training.iteration - first,
         );
         Ok(TrainerReport {
-            iterations: self.course.iteration,
+            iterations: self.training.iteration,
             steps_here: steps,
             seconds,
             iterations_per_second: f64::from(steps.saturating_sub(1)) / seconds.max(1e-9),
             gaussians: self.engine.len(),
-            removals: self.course.removals.clone(),
-            background: self.course.background.values,
-            alignment_gain: self.course.alignment_gain,
+            removals: self.training.removals.clone(),
+            background: self.training.background.values,
+            alignment_gain: self.training.alignment_gain,
             adapter: self.engine.name(),
         })
     }
@@ -460,14 +464,14 @@ impl Trainer {
     /// As [`Engine::render`].
     pub fn render(&mut self, camera: &Camera) -> Result<Frame> {
         self.engine.render(
-            self.view(camera, self.course.config.degree(self.course.iteration)),
+            self.view(camera, self.training.config.degree(self.training.iteration)),
             Channels::Both,
         )
     }
 
     /// Returns the exposures of the training views; empty if they are not learned.
     pub fn exposures(&self) -> Vec<Exposure> {
-        self.course
+        self.training
             .exposures
             .iter()
             .map(LearnedExposure::exposure)
@@ -482,7 +486,7 @@ impl Trainer {
         let state = self.engine.state()?;
         let course = TrainingState {
             gaussians: state.len(),
-            ..self.course.clone()
+            ..self.training.clone()
         };
         checkpoint::save(path, &course, &state, &self.engine.stats()?)
     }
@@ -496,9 +500,9 @@ impl Trainer {
             return Ok(false);
         };
         let other = match () {
-            () if course.config != self.course.config => Some("with other options"),
-            () if course.views != self.course.views => Some("from other photos"),
-            () if course.shown != 0 && course.shown != self.course.shown => {
+            () if course.config != self.training.config => Some("with other options"),
+            () if course.views != self.training.views => Some("from other photos"),
+            () if course.shown != 0 && course.shown != self.training.shown => {
                 Some("from other images, objects or first Gaussians")
             }
             () => None,
@@ -519,7 +523,7 @@ impl Trainer {
             iteration = course.iteration,
             "training continues from its checkpoint"
         );
-        self.course = course;
+        self.training = course;
         Ok(true)
     }
 }

@@ -12,11 +12,11 @@ use crate::target::Targets;
 
 impl Trainer {
     /// Returns the validation views: training views that are held out while the scene grows.
-    pub(super) fn watched(&self) -> Targets {
+    pub(super) fn validation_views(&self) -> Targets {
         let count = self.targets.len();
         self.targets.subset(
             (0..count)
-                .filter(|&i| budget::is_watched(i, count))
+                .filter(|&i| budget::is_validation_view(i, count))
                 .collect(),
         )
     }
@@ -28,10 +28,10 @@ impl Trainer {
     /// As [`crate::engine::Engine::render`].
     pub fn needed_degree(&mut self) -> Result<u32> {
         let (highest, watched) = (
-            self.course.config.degree(self.course.iteration),
-            self.watched(),
+            self.training.config.degree(self.training.iteration),
+            self.validation_views(),
         );
-        let automatic = matches!(self.course.config.budget, Budget::Auto(_));
+        let automatic = matches!(self.training.config.budget, Budget::Auto(_));
         let Some(best) = self.quality(&watched, Some(highest))?.filter(|_| automatic) else {
             return Ok(highest);
         };
@@ -52,10 +52,10 @@ impl Trainer {
         whole.keep_finite();
         self.replace(&whole)?;
         let (scores, squared_error) = self.saliency()?;
-        let judges = self.cost_views();
-        let psnr_before = self.quality(&judges, None)?;
+        let cost_views = self.cost_views();
+        let psnr_before = self.quality(&cost_views, None)?;
         let mut removal = Removal {
-            iteration: self.course.iteration,
+            iteration: self.training.iteration,
             before: whole.len(),
             after: whole.len(),
             psnr_before,
@@ -65,19 +65,19 @@ impl Trainer {
             let mut state = whole.clone();
             state.keep(&places);
             self.replace(&state)?;
-            (removal.after, removal.psnr_after) = (state.len(), self.quality(&judges, None)?);
+            (removal.after, removal.psnr_after) = (state.len(), self.quality(&cost_views, None)?);
             if removal.is_acceptable() {
                 break;
             }
         }
         tracing::info!(?removal, "removed unimportant Gaussians");
-        self.course.removals.push(removal);
+        self.training.removals.push(removal);
         Ok(())
     }
 
     /// Returns how much the training views change without each Gaussian, and their squared error.
     fn saliency(&mut self) -> Result<(Vec<f32>, f64)> {
-        let degree = self.course.config.degree(self.course.iteration);
+        let degree = self.training.config.degree(self.training.iteration);
         let mut scores = vec![0.0; self.engine.len()];
         let mut squared_error = 0.0;
         for id in 0..self.targets.len() {
@@ -95,10 +95,13 @@ impl Trainer {
     /// Returns the views that measure the cost of a removal: the validation views, else every tenth
     /// view.
     pub(super) fn cost_views(&self) -> Targets {
-        let watched = self.watched();
+        let watched = self.validation_views();
         if watched.is_empty() {
-            self.targets
-                .subset((0..self.targets.len()).step_by(budget::WATCHED).collect())
+            self.targets.subset(
+                (0..self.targets.len())
+                    .step_by(budget::VALIDATION_INTERVAL)
+                    .collect(),
+            )
         } else {
             watched
         }
@@ -113,7 +116,7 @@ mod tests {
     use glam::Vec3;
 
     #[test]
-    fn of_two_that_hide_each_other_one_stays() {
+    fn prune_keeps_one_of_two_redundant_gaussians() {
         let camera = Camera::look_at(
             "a",
             Vec3::new(0.0, 0.0, -4.0),
@@ -147,7 +150,7 @@ mod tests {
         let mut trainer =
             Trainer::new(Box::new(CpuEngine::new()), &scene, vec![target], config).unwrap();
         trainer.prune().unwrap();
-        let removal = trainer.course.removals[0];
+        let removal = trainer.training.removals[0];
         assert_eq!((removal.before, removal.after), (3, 2), "{removal:?}");
         assert!(
             (removal.psnr_before.unwrap() - removal.psnr_after.unwrap()).abs() < 1.0,

@@ -46,16 +46,16 @@ pub fn adjust(
     keypoints: &[Keypoints],
     matches: &[PairMatches],
 ) -> Option<BundleReport> {
-    let given = cameras.to_vec();
+    let initial = cameras.to_vec();
     let obeying = |cameras: &[Camera], keypoints: &[Keypoints], tolerance: f32| -> Vec<Track> {
         let matches: Vec<PairMatches> = matches
             .iter()
-            .map(|m| m.obeying(cameras, keypoints, tolerance))
+            .map(|m| m.inliers(cameras, keypoints, tolerance))
             .collect();
         tracks(cameras, keypoints, &matches, tolerance)
     };
-    let before = quality(&obeying(&given, keypoints, TOLERANCE));
-    let lens = lenses(&given);
+    let before = quality(&obeying(&initial, keypoints, TOLERANCE));
+    let lens = lenses(&initial);
     let mut values = Values {
         poses: Vec::new(),
         lenses: vec![Lens::default(); lens.iter().flatten().max().map_or(0, |l| l + 1)],
@@ -66,14 +66,14 @@ pub fn adjust(
         // tolerance.
         let tracks = obeying(
             cameras,
-            &straight(keypoints, cameras, &lens, &values.lenses),
+            &undistorted(keypoints, cameras, &lens, &values.lenses),
             round * TOLERANCE,
         );
         if tracks.is_empty() {
             return None;
         }
         let problem = Problem {
-            cameras: &given,
+            cameras: &initial,
             lens: lens.clone(),
             seen: observations(&tracks, keypoints),
         };
@@ -82,17 +82,17 @@ pub fn adjust(
         problem.solve(&mut values);
         values.apply(&problem, cameras);
     }
-    keep_gauge(cameras, &given);
+    keep_gauge(cameras, &initial);
     let after = obeying(
         cameras,
-        &straight(keypoints, cameras, &lens, &values.lenses),
+        &undistorted(keypoints, cameras, &lens, &values.lenses),
         TOLERANCE,
     );
     let lens_of = |view: usize| lens[view].map_or_else(Lens::default, |l| values.lenses[l]);
     Some(BundleReport {
         error: [before.0, quality(&after).0],
         observations: [before.1, quality(&after).1],
-        moved: movements(&given, cameras, &after),
+        moved: movements(&initial, cameras, &after),
         focal: (0..cameras.len())
             .map(|v| lens_of(v).log_focal.exp() as f32)
             .collect(),
@@ -100,8 +100,8 @@ pub fn adjust(
     })
 }
 
-/// Returns the key points as lenses without distortion would show them.
-fn straight(
+/// Returns the key points without the distortion of their lenses.
+fn undistorted(
     keypoints: &[Keypoints],
     cameras: &[Camera],
     lens: &[Option<usize>],
@@ -109,7 +109,7 @@ fn straight(
 ) -> Vec<Keypoints> {
     let mut out = keypoints.to_vec();
     for (view, points) in out.iter_mut().enumerate() {
-        let Some(bend) = lens[view].map(|l| Distortion {
+        let Some(distortion) = lens[view].map(|l| Distortion {
             k1: lenses[l].k1 as f32,
             ..Distortion::default()
         }) else {
@@ -118,17 +118,17 @@ fn straight(
         points
             .positions
             .iter_mut()
-            .for_each(|p| *p = bend.undistort_pixel(&cameras[view], *p));
+            .for_each(|p| *p = distortion.undistort_pixel(&cameras[view], *p));
     }
     out
 }
 
 /// Returns the root mean square reprojection error in pixels and the number of observations.
 fn quality(tracks: &[Track]) -> (f32, usize) {
-    let count: usize = tracks.iter().map(|t| t.seen.len()).sum();
+    let count: usize = tracks.iter().map(|t| t.key_points.len()).sum();
     let square: f32 = tracks
         .iter()
-        .map(|t| t.error * t.error * t.seen.len() as f32)
+        .map(|t| t.error * t.error * t.key_points.len() as f32)
         .sum();
     ((square / count.max(1) as f32).sqrt(), count)
 }
@@ -160,7 +160,7 @@ fn observations(tracks: &[Track], keypoints: &[Keypoints]) -> Vec<Vec<Observatio
     };
     tracks
         .iter()
-        .map(|track| track.seen.iter().map(of).collect())
+        .map(|track| track.key_points.iter().map(of).collect())
         .collect()
 }
 
@@ -193,7 +193,7 @@ fn keep_gauge(cameras: &mut [Camera], given: &[Camera]) {
 fn movements(given: &[Camera], cameras: &[Camera], tracks: &[Track]) -> Vec<f32> {
     let mut distances: Vec<Vec<f32>> = vec![Vec::new(); cameras.len()];
     for track in tracks {
-        for &(view, _) in &track.seen {
+        for &(view, _) in &track.key_points {
             let at = |c: &Camera| c.to_pixel(c.world_to_camera.transform_point3(track.position));
             distances[view].push(at(&given[view]).distance(at(&cameras[view])));
         }
@@ -224,7 +224,7 @@ mod tests {
         };
         let keypoints: Vec<Keypoints> = cameras
             .iter()
-            .map(|c| ring::seen(c, &cloud, &mut error))
+            .map(|c| ring::key_points(c, &cloud, &mut error))
             .collect();
         let near = |a: usize| (a + 1..count.min(a + 6)).map(move |b| (a, b));
         let matched = |(a, b): (usize, usize)| PairMatches {
@@ -238,7 +238,7 @@ mod tests {
 
     /// Median distance in pixels between the projections of points around the origin by two
     /// cameras.
-    fn off(a: &[Camera], b: &[Camera]) -> f32 {
+    fn median_shift(a: &[Camera], b: &[Camera]) -> f32 {
         let points: Vec<Vec3> = (0..8)
             .map(|k| Vec3::new((k & 1) as f32, (k >> 1 & 1) as f32, (k >> 2) as f32) - 0.5)
             .collect();
@@ -259,7 +259,7 @@ mod tests {
 
     /// Mean difference, in pixels, between the rotations from each camera to the next. It does not
     /// depend on the world frame.
-    fn turned(a: &[Camera], b: &[Camera]) -> f32 {
+    fn mean_rotation_difference(a: &[Camera], b: &[Camera]) -> f32 {
         let turn = |c: &Camera| Quat::from_mat4(&c.world_to_camera);
         let turns = |all: &[Camera]| {
             all.windows(2)
@@ -288,7 +288,10 @@ mod tests {
         }
         let given = cameras.clone();
         let report = adjust(&mut cameras, &keypoints, &matches).unwrap();
-        let [before, after] = [turned(&given, &truth), turned(&cameras, &truth)];
+        let [before, after] = [
+            mean_rotation_difference(&given, &truth),
+            mean_rotation_difference(&cameras, &truth),
+        ];
         // In a small cloud, rotation and translation look alike, so their remaining errors
         // compensate.
         assert!(
@@ -307,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_focal_length_and_a_bent_lens_are_found() {
+    fn focal_length_and_radial_distortion_are_recovered() {
         let (truth, mut keypoints, matches) = noisy_ring(24);
         let mut cameras = truth.clone();
         cameras
@@ -334,9 +337,9 @@ mod tests {
         let mut cameras = truth.clone();
         let report = adjust(&mut cameras, &keypoints, &matches).unwrap();
         assert!(
-            off(&cameras, &truth) < 0.2 && (report.focal[0] - 1.0).abs() < 0.003,
+            median_shift(&cameras, &truth) < 0.2 && (report.focal[0] - 1.0).abs() < 0.003,
             "{} {}",
-            off(&cameras, &truth),
+            median_shift(&cameras, &truth),
             report.focal[0]
         );
         assert!(adjust(&mut cameras, &keypoints, &[]).is_none());

@@ -149,7 +149,8 @@ impl Problem<'_> {
         })
     }
 
-    /// Returns the sum of Cauchy's loss over all observations, plus the prior of the lenses.
+    /// Returns the sum of Cauchy's loss over all observations, plus the prior of the lenses. A
+    /// point behind a camera costs 1,000.
     fn cost(&self, values: &Values) -> f64 {
         let of_point = |(seen, point): (&Vec<Observation>, &DVec3)| -> f64 {
             let loss = |o: &Observation| {
@@ -203,7 +204,7 @@ impl Problem<'_> {
                 ),
         ];
         let by_q = by_ray.map(|row| (row / q.z).extend(-row.dot(ray) / q.z));
-        // q moves by turn x q + shift.
+        // A small pose change moves q by turn x q + shift.
         let by_turn = by_q.map(|row| q.cross(row));
         let by_point = by_q.map(|row| pose.rotation.transpose() * row);
         let by_lens = [0, 1].map(|k| [focal[k] * ray[k] * radial, focal[k] * ray[k] * r2]);
@@ -285,6 +286,7 @@ impl Problem<'_> {
         (all, eliminated)
     }
 
+    /// Adds the observations of one point to `reduced` and eliminates the point.
     fn eliminate_one(
         &self,
         values: &Values,
@@ -390,8 +392,8 @@ impl Problem<'_> {
     }
 }
 
-/// Values from which the step of a point is computed, once the steps of the cameras are known: the
-/// inverse of its own block, its right side, and its couplings to cameras.
+/// Values from which the step of a point is computed, after the steps of the cameras: the inverse
+/// of the point's block of the normal matrix, its right-hand side, and its couplings to cameras.
 struct Eliminated {
     inverse: SMatrix<f64, 3, 3>,
     right: SVector<f64, 3>,
@@ -426,7 +428,7 @@ mod tests {
     }
 
     #[test]
-    fn slopes_are_those_of_finite_differences() {
+    fn derivatives_agree_with_finite_differences() {
         let camera = Camera::look_at(
             "a",
             Vec3::new(0.3, -0.2, -4.0),

@@ -22,8 +22,8 @@ const MIN_SUPPORT: f32 = 0.12;
 /// Smallest parallax of a point that a fit uses, in radians. At smaller angles its depth is noise.
 const MIN_PARALLAX: f32 = 0.03;
 
-/// A matched point: its position in the group that moves, its target position, and the key point
-/// there.
+/// A matched point: its position by the group that moves (`from`), its position by the groups that
+/// stay (`to`), and the key point that shows it in a photo that stays.
 #[derive(Clone, Copy)]
 pub(super) struct Pair {
     pub from: Vec3,
@@ -45,7 +45,7 @@ pub(super) fn points_of(
         .iter()
         .filter(|l| l.agrees() && group[l.a] == group[l.b])
     {
-        for &(i, j) in &link.right {
+        for &(i, j) in &link.inliers {
             let (pa, pb) = (
                 keypoints[link.a].positions[i],
                 keypoints[link.b].positions[j],
@@ -178,7 +178,7 @@ pub(super) fn refined(
             .sum::<f32>()
     };
     let mut best = first;
-    for width in [8.0, 8.0, 4.0, 4.0, 2.0, 2.0, 2.0, 2.0] {
+    for loss_scale in [8.0, 8.0, 4.0, 4.0, 2.0, 2.0, 2.0, 2.0] {
         let now = residuals(&best);
         const STEP: f32 = 1e-4;
         let slopes: Vec<Vec<f32>> = (0..7)
@@ -194,7 +194,7 @@ pub(super) fn refined(
             .collect();
         let (mut normal, mut right) = (SMatrix::<f64, 7, 7>::zeros(), SVector::<f64, 7>::zeros());
         for (m, r) in now.iter().enumerate() {
-            let w = f64::from(weight(*r, width));
+            let w = f64::from(weight(*r, loss_scale));
             let row = SVector::<f64, 7>::from_fn(|k, _| slopes[k][m].into());
             normal += w * row * row.transpose();
             right -= w * f64::from(*r) * row;
@@ -204,7 +204,7 @@ pub(super) fn refined(
             break;
         };
         let next = best.followed_by_small(&std::array::from_fn(|k| delta[k] as f32));
-        if cost(&residuals(&next), width) < cost(&now, width) {
+        if cost(&residuals(&next), loss_scale) < cost(&now, loss_scale) {
             best = next;
         }
     }

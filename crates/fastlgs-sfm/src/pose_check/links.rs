@@ -17,21 +17,24 @@ pub(super) const SAME_DIRECTION: f32 = 0.75;
 /// Smallest number of matches, or of inliers, that counts as evidence.
 pub(super) const MIN_MATCHES: usize = 25;
 
-/// Matches of two photos as (key point in a, key point in b), and their epipolar inliers (`inliers`).
+/// All matches of two photos, as (key point in a, key point in b), and those that are epipolar
+/// inliers.
 pub(super) struct Link {
     pub a: usize,
     pub b: usize,
     pub all: Vec<(usize, usize)>,
-    pub right: Vec<(usize, usize)>,
+    pub inliers: Vec<(usize, usize)>,
 }
 
 impl Link {
+    /// Returns whether at least [`MIN_MATCHES`] matches, and at least half of them, are inliers.
     pub fn agrees(&self) -> bool {
-        self.right.len() >= MIN_MATCHES && 2 * self.right.len() >= self.all.len()
+        self.inliers.len() >= MIN_MATCHES && 2 * self.inliers.len() >= self.all.len()
     }
 
+    /// Returns whether fewer than 30 % of at least [`MIN_MATCHES`] matches are inliers.
     pub fn contradicts(&self) -> bool {
-        self.all.len() >= MIN_MATCHES && 10 * self.right.len() < 3 * self.all.len()
+        self.all.len() >= MIN_MATCHES && 10 * self.inliers.len() < 3 * self.all.len()
     }
 }
 
@@ -48,10 +51,11 @@ pub(super) fn inliers(
         b,
         pairs: all.to_vec(),
     }
-    .obeying(cameras, keypoints, TOLERANCE)
+    .inliers(cameras, keypoints, TOLERANCE)
     .pairs
 }
 
+/// Matches all pairs of photos that are near by name, or that overlap by their poses.
 pub(super) fn links(cameras: &[Camera], keypoints: &[Keypoints]) -> Vec<Link> {
     let n = cameras.len();
     let mut pairs = overlapping_pairs(cameras, OVERLAPPING);
@@ -62,6 +66,7 @@ pub(super) fn links(cameras: &[Camera], keypoints: &[Keypoints]) -> Vec<Link> {
     matched(pairs, cameras, keypoints)
 }
 
+/// Matches these pairs of photos.
 pub(super) fn matched(
     pairs: Vec<(usize, usize)>,
     cameras: &[Camera],
@@ -70,7 +75,12 @@ pub(super) fn matched(
     let link = |(a, b): (usize, usize)| {
         let all = matches(&keypoints[a], &keypoints[b]);
         let right = inliers(cameras, keypoints, a, b, &all);
-        Link { a, b, all, right }
+        Link {
+            a,
+            b,
+            all,
+            inliers: right,
+        }
     };
     pairs.into_par_iter().map(link).collect()
 }
@@ -80,7 +90,7 @@ pub(super) fn matched(
 pub(super) fn groups(n: usize, links: &[Link]) -> Vec<usize> {
     let mut group: Vec<usize> = (0..n).collect();
     let mut agreeing: Vec<&Link> = links.iter().filter(|l| l.agrees()).collect();
-    agreeing.sort_by_key(|l| (std::cmp::Reverse(l.right.len()), l.a, l.b));
+    agreeing.sort_by_key(|l| (std::cmp::Reverse(l.inliers.len()), l.a, l.b));
     for link in agreeing {
         let (a, b) = (group[link.a], group[link.b]);
         if a == b {

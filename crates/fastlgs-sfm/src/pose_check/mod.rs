@@ -1,9 +1,9 @@
 //! Checks poses against the photos and repairs them.
 //!
-//! Structure from motion that repeated texture misled leaves groups of photos. Each group is
-//! consistent, but wrongly placed relative to the others. Between consecutive photos of two such
-//! groups many key points match, but few matches satisfy the epipolar geometry of the poses.
-//! `repair` moves such a group by the similarity that aligns its matched points.
+//! Repeated texture can mislead structure from motion. The photos then form groups: each group is
+//! consistent, but misplaced relative to the others. Between consecutive photos of two such groups
+//! many key points match, but few matches satisfy the epipolar geometry of the poses. `repair`
+//! moves such a group by the similarity that aligns its matched points.
 
 mod fit;
 mod links;
@@ -95,7 +95,7 @@ pub fn repair(cameras: &mut [Camera], keypoints: &[Keypoints], seed: u64) -> Pos
         .collect();
     again.sort_by_key(|&(lost, g)| (!lost, std::cmp::Reverse(sizes[&g]), g));
     for (lost, next) in again {
-        work.look_everywhere(next);
+        work.link_to_all_photos(next);
         let others = settled.iter().copied().filter(|g| *g != next).collect();
         if work.place(next, &others, lost) {
             settled.insert(next);
@@ -164,7 +164,7 @@ impl Repair<'_> {
             .links
             .iter()
             .filter(counts)
-            .fold((0, 0), |(r, a), l| (r + l.right.len(), a + l.all.len()));
+            .fold((0, 0), |(r, a), l| (r + l.inliers.len(), a + l.all.len()));
         tracing::debug!(
             group = next,
             right,
@@ -187,10 +187,11 @@ impl Repair<'_> {
             > SAME_DIRECTION
     }
 
-    /// Moves a group so that its matches with `others` fit, and returns whether a better place was
+    /// Moves a group so that its matches with `others` fit. Returns whether a better position was
     /// found.
-    /// If the group is `lost`, it is far from its place; its links then count whatever their
-    /// viewing directions.
+    ///
+    /// A `lost` group is far from its true position, so its viewing directions are unreliable. All
+    /// of its links are then used, not only those between similar directions.
     fn place(&mut self, next: usize, others: &BTreeSet<usize>, lost: bool) -> bool {
         let counts = |l: &&Link| {
             l.all.len() >= MIN_MATCHES
@@ -248,14 +249,14 @@ impl Repair<'_> {
             .iter_mut()
             .filter(|l| (group[l.a] == next) != (group[l.b] == next))
         {
-            link.right = inliers(self.cameras, self.keypoints, link.a, link.b, &link.all);
+            link.inliers = inliers(self.cameras, self.keypoints, link.a, link.b, &link.all);
         }
         true
     }
 
     /// Adds links between a group and every second other photo. Misplaced poses do not show which
     /// photos overlap.
-    fn look_everywhere(&mut self, next: usize) {
+    fn link_to_all_photos(&mut self, next: usize) {
         let known: BTreeSet<(usize, usize)> = self.links.iter().map(|l| (l.a, l.b)).collect();
         let (members, others): (Vec<usize>, Vec<usize>) =
             (0..self.cameras.len()).partition(|&i| self.group[i] == next);
@@ -291,7 +292,7 @@ fn next_group(
                 } else {
                     0
                 };
-                *pro += if link.agrees() { link.right.len() } else { 0 };
+                *pro += if link.agrees() { link.inliers.len() } else { 0 };
             }
         }
     }
@@ -314,7 +315,7 @@ mod tests {
         let (cloud, cameras) = (ring::cloud(&mut Rng::new(5, "ring")), ring::cameras(count));
         let keypoints = cameras
             .iter()
-            .map(|c| ring::seen(c, &cloud, || Vec2::ZERO))
+            .map(|c| ring::key_points(c, &cloud, || Vec2::ZERO))
             .collect();
         (cameras, keypoints)
     }
@@ -361,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_mended_is_named() {
+    fn unrepairable_photos_are_reported_as_contradictory() {
         let (mut cameras, mut keypoints) = exact_ring(16);
         let wrong = Similarity {
             scale: 1.0,

@@ -73,11 +73,12 @@ pub struct Logits {
     pub scores: Vec<f32>,
     /// Masks per prompt.
     pub masks: usize,
-    /// Cells along y (`rows`) and x (`columns`).
+    /// Cells along y.
     pub rows: usize,
+    /// Cells along x.
     pub columns: usize,
     /// Cells along x and y that cover the image; the others are padding.
-    pub shown: [usize; 2],
+    pub covered_cells: [usize; 2],
     /// Cells per pixel of the image, along x and y.
     pub scale: [f32; 2],
 }
@@ -107,14 +108,14 @@ impl Exports {
             }
         } else {
             let names: Vec<&str> = decoder.inputs.iter().map(|i| i.name.as_str()).collect();
-            return Err(decoder.refuse(format!(
+            return Err(decoder.error(format!(
                 "this is not a supported SAM decoder; its inputs are {}",
                 names.join(", ")
             )));
         };
         if encoder.inputs.len() != 1 {
             return Err(
-                encoder.refuse("this is not a SAM image encoder; it must have exactly one input")
+                encoder.error("this is not a SAM image encoder; it must have exactly one input")
             );
         }
         let asked: &[&str] = match kind {
@@ -152,7 +153,7 @@ impl Exports {
                 .filter(|_| encoder.outputs.len() == 1 && EMBEDDING.contains(&input));
             let output = named.or(only).ok_or_else(|| {
                 let outputs = encoder.outputs.join(", ");
-                decoder.refuse(format!("its input '{input}' matches no output of the encoder ({outputs}); check that both files belong to the same model"))
+                decoder.error(format!("its input '{input}' matches no output of the encoder ({outputs}); check that both files belong to the same model"))
             })?;
             passed.push((input.to_owned(), output.to_owned()));
         }
@@ -207,7 +208,7 @@ impl Exports {
                 }
             }
             shape => {
-                return Err(self.encoder.refuse(format!(
+                return Err(self.encoder.error(format!(
                     "its input '{}' has shape {shape:?}, which is not that of an image",
                     slot.name
                 )));
@@ -299,7 +300,7 @@ impl Exports {
         let find = |names: &[&str], what: &str| {
             self.decoder
                 .output(names)
-                .ok_or_else(|| self.decoder.refuse(format!("it has no output for {what}")))
+                .ok_or_else(|| self.decoder.error(format!("it has no output for {what}")))
         };
         let masks = find(
             &["low_res_masks", "pred_masks", "output_masks", "masks"],
@@ -312,7 +313,7 @@ impl Exports {
         let mut found = self.decoder.run(inputs, &[masks, scores])?;
         let (scores, logits) = (found.remove(1).values, found.remove(0));
         let [.., masks, rows, columns] = logits.shape[..] else {
-            return Err(self.decoder.refuse(format!(
+            return Err(self.decoder.error(format!(
                 "its masks have the unsupported shape {:?}",
                 logits.shape
             )));
@@ -321,7 +322,7 @@ impl Exports {
             || scores.len() != n * masks
             || logits.values.len() != n * masks * rows * columns
         {
-            return Err(self.decoder.refuse(format!("{n} prompts returned masks of shape {:?} and {} scores; these numbers do not fit together", logits.shape, scores.len())));
+            return Err(self.decoder.error(format!("{n} prompts returned masks of shape {:?} and {} scores; these numbers do not fit together", logits.shape, scores.len())));
         }
         let shown = self.image_cells(encoded, [columns, rows]);
         let scale = [0, 1].map(|k| shown[k] / encoded.size[k] as f32);
@@ -335,7 +336,7 @@ impl Exports {
             masks,
             rows,
             columns,
-            shown,
+            covered_cells: shown,
             scale,
         })
     }
@@ -367,7 +368,7 @@ impl Exports {
         *points.shape.get(prompts)?
     }
 
-    /// Returns the largest number of prompts per inference whose masks fit into [`MAX_MASK_BYTES`] bytes.
+    /// Returns the largest number of prompts per inference whose masks fit into [`MAX_MASK_BYTES`].
     /// EfficientSAM returns masks in the size of the image.
     pub fn most_prompts(&self, encoded: &Encoded) -> usize {
         let cells = if self.kind == Kind::Efficient {
@@ -379,8 +380,8 @@ impl Exports {
     }
 
     /// Returns an error that names the decoder and the reason.
-    pub fn refuse(&self, reason: &str) -> Error {
-        self.decoder.refuse(reason)
+    pub fn error(&self, reason: &str) -> Error {
+        self.decoder.error(reason)
     }
 }
 

@@ -29,8 +29,11 @@ const MIN_LEVEL_AREAS: [f32; 2] = [0.03, 0.005];
 /// A mask that passed the filters.
 #[derive(Clone, Debug)]
 pub struct Candidate {
+    /// Size class.
     pub level: Level,
+    /// IoU with the true object, as the model predicts it, 0 to 1.
     pub predicted_iou: f32,
+    /// IoU of the masks thresholded at plus and minus `STABILITY_OFFSET`, 0 to 1.
     pub stability: f32,
     /// Mask in pixels of the photo, or of the crop until it is placed.
     pub mask: BitMask,
@@ -154,12 +157,13 @@ fn masks_of_prompt(
     config: &SamConfig,
 ) -> Vec<Candidate> {
     let cells = logits.rows * logits.columns;
-    // The first of four masks is for prompts of several points.
+    // The first of four masks is meant for prompts of several points. Each prompt here is one
+    // point.
     let skipped = usize::from(logits.masks == 4);
     let grid = |mask: usize| Grid {
         logits: &logits.values[(prompt * logits.masks + mask) * cells..][..cells],
         columns: logits.columns,
-        shown: logits.shown,
+        covered_cells: logits.covered_cells,
         scale: logits.scale,
     };
     let mut masks: Vec<(usize, usize)> = (skipped..logits.masks)
@@ -262,16 +266,18 @@ pub fn suppressed(mut candidates: Vec<Candidate>, rule: &Suppression) -> Vec<Can
     let score = |c: &Candidate| c.predicted_iou * c.stability;
     candidates.sort_by(|a, b| score(b).total_cmp(&score(a)));
     let areas: Vec<f32> = candidates.iter().map(|c| c.mask.area() as f32).collect();
-    let gives_way = |k: usize, other: usize| {
+    let is_suppressed_by = |k: usize, other: usize| {
         let common = candidates[k].mask.common(&candidates[other].mask) as f32;
         let [own, theirs] = [k, other].map(|c| common / areas[c]);
         let repeats = other < k && common / (areas[k] + areas[other] - common) > rule.iou;
-        repeats || (own >= rule.held && theirs < 0.5 && own * theirs < rule.inner)
+        repeats || (own >= rule.containment && theirs < 0.5 && own * theirs < rule.inner)
     };
     let all = 0..candidates.len();
     let stays = |k: &usize| {
         score(&candidates[*k]) > rule.score
-            && !all.clone().any(|other| other != *k && gives_way(*k, other))
+            && !all
+                .clone()
+                .any(|other| other != *k && is_suppressed_by(*k, other))
     };
     let mut kept: Vec<Candidate> = all
         .clone()
@@ -315,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_crop_cut_off_is_left_to_the_others() {
+    fn masks_cut_off_by_a_crop_are_dropped() {
         let photo = RgbImage::new(200, 100);
         let of = |bounds: [u32; 4], crop: [u32; 4]| {
             placed(candidate(bounds, 1.0), &photo, crop).map(|c| c.mask.bounds)
@@ -347,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn the_order_of_prompts_decides_nothing() {
+    fn result_does_not_depend_on_the_order_of_prompts() {
         // The second overlaps the first and the third. The third suppresses the second, so the
         // first remains.
         let of = |x: u32, score: f32| candidate([x, 0, x + 100, 10], score);
@@ -368,12 +374,12 @@ mod tests {
     }
 
     #[test]
-    fn repetitions_and_small_parts_go() {
+    fn repeated_small_and_low_score_masks_are_suppressed() {
         let rule = Suppression {
             iou: 0.8,
             score: 0.7,
             inner: 0.5,
-            held: 0.85,
+            containment: 0.85,
         };
         let scores = |all: Vec<Candidate>| {
             suppressed(all, &rule)

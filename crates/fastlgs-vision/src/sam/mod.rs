@@ -46,11 +46,11 @@ pub struct Suppression {
     pub iou: f32,
     /// Score, predicted IoU times stability, that a mask must exceed.
     pub score: f32,
-    /// Limit of the product of the intersection's shares of both masks. Below it, a contained mask
-    /// that covers less than half of the other is suppressed.
+    /// Limit of a product: the intersection as a share of one mask, times its share of the other.
+    /// Below the limit, a contained mask that covers less than half of the other is suppressed.
     pub inner: f32,
-    /// Share of a mask in the intersection from which the mask counts as contained in the other.
-    pub held: f32,
+    /// Share of a mask that must lie in another mask for it to count as contained.
+    pub containment: f32,
 }
 
 impl Default for SamConfig {
@@ -75,7 +75,7 @@ impl SamConfig {
             iou: 0.8,
             score: 0.7,
             inner: 0.5,
-            held: 0.85,
+            containment: 0.85,
         });
         Self {
             predicted_iou: 0.7,
@@ -166,7 +166,7 @@ impl Segmenter for Sam {
             if !self.found.load(Ordering::Relaxed)
                 && self.photos_without_mask.fetch_add(1, Ordering::Relaxed) + 1 >= MAX_EMPTY_PHOTOS
             {
-                return Err(self.exports.refuse("it found no mask in any of the first photos; check that encoder and decoder belong to the same model"));
+                return Err(self.exports.error("it found no mask in any of the first photos; check that encoder and decoder belong to the same model"));
             }
         }
         let with_level = |c: Candidate| {
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn crops_and_suppression_leave_the_same_things() {
+    fn crops_and_suppression_keep_the_same_objects() {
         let config = SamConfig {
             points_per_side: 8,
             ..SamConfig::langsplat()
@@ -332,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn a_single_mask_a_prompt_gets_its_level_by_its_size() {
+    fn single_masks_get_their_level_by_area() {
         let config = SamConfig {
             points_per_side: 12,
             ..SamConfig::default()
@@ -356,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn filters_drop_what_the_model_doubts() {
+    fn masks_with_a_low_predicted_iou_are_dropped() {
         let config = SamConfig {
             points_per_side: 4,
             predicted_iou: 0.99,
@@ -365,7 +365,7 @@ mod tests {
         let Some((_dir, sam)) = sam(SamExport::Transformers, config) else {
             return;
         };
-        // A few photos may have no mask; after IN_NONE photos it is an error.
+        // If none of the first MAX_EMPTY_PHOTOS photos has a mask, it is an error.
         let mut photos = (0..MAX_EMPTY_PHOTOS).map(|_| sam.segment("", &photo()));
         assert!(
             photos

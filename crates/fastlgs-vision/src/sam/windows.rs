@@ -19,18 +19,18 @@ pub struct Window {
 pub struct Grid<'a> {
     pub logits: &'a [f32],
     pub columns: usize,
-    pub shown: [usize; 2],
+    pub covered_cells: [usize; 2],
     pub scale: [f32; 2],
 }
 
 impl Grid<'_> {
     fn row(&self, y: usize) -> &[f32] {
-        &self.logits[y * self.columns..][..self.shown[0]]
+        &self.logits[y * self.columns..][..self.covered_cells[0]]
     }
 
     /// Returns the number of cells above a threshold.
     pub fn area(&self, threshold: f32) -> usize {
-        (0..self.shown[1])
+        (0..self.covered_cells[1])
             .map(|y| self.row(y).iter().filter(|v| **v > threshold).count())
             .sum()
     }
@@ -38,7 +38,7 @@ impl Grid<'_> {
     /// Returns the smallest window around all cells above a threshold, with a margin of one cell
     /// for interpolation. Returns `None` if there are none.
     pub fn window(&self, threshold: f32) -> Option<Window> {
-        let [width, height] = self.shown;
+        let [width, height] = self.covered_cells;
         let mut b = [usize::MAX, usize::MAX, 0, 0];
         for y in 0..height {
             for (x, _) in self.row(y).iter().enumerate().filter(|v| *v.1 > threshold) {
@@ -130,7 +130,7 @@ mod tests {
         let grid = Grid {
             logits: &logits,
             columns: 4,
-            shown: [3, 2],
+            covered_cells: [3, 2],
             scale: [0.25, 0.25],
         };
         assert_eq!((grid.area(0.0), grid.area(-2.0)), (2, 6));

@@ -65,6 +65,7 @@ pub fn quality(scene: &mut Scene) -> Result<Option<Quality>> {
     Ok((views > 0).then_some(all))
 }
 
+/// Returns the camera of a view with its pose aligned to the scene.
 fn align_camera(scene: &mut Scene, target: &Target) -> Result<Camera> {
     let (trained, gaussians) = (scene.trained().clone(), scene.gaussians().len());
     let degree = scene.gaussians().sh_degree;

@@ -89,7 +89,7 @@ pub struct EvalReport {
     pub oracle_miou: Option<f64>,
     /// Oracle mIoU by label.
     pub oracle_by_label: BTreeMap<String, Option<f64>>,
-    /// Share of the pixels of a label that the best object of no other label covers.
+    /// Share of a label's pixels that are not covered by the best object of another label.
     pub apart: Option<f64>,
     /// Share of labels that contain more than half of the first-ranked object.
     pub text_top1: Option<f64>,
@@ -165,6 +165,7 @@ pub struct Absent {
     pub score: f64,
 }
 
+/// Values of all labels and queries, from which the report is computed.
 #[derive(Default)]
 struct Sums {
     iou: Vec<f64>,
@@ -193,16 +194,16 @@ fn mean(values: &[f64]) -> Option<f64> {
 /// # Errors
 /// A scene that is not trained, labels of a view that is not held out, or a device that fails.
 pub fn eval(config: &EvalConfig, run: &Run) -> Result<EvalReport> {
-    let mut session = Scene::open(&config.scene, run.device)?;
-    session.set_clip_text(config.clip_text.clone());
-    eval_session(session, config)
+    let mut scene = Scene::open(&config.scene, run.device)?;
+    scene.set_clip_text(config.clip_text.clone());
+    eval_scene(scene, config)
 }
 
 /// Measures accuracy of an opened scene.
 ///
 /// # Errors
 /// As [`eval`].
-pub fn eval_session(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport> {
+pub fn eval_scene(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport> {
     scene.ignore_taught_names();
     let grid = scene.grid()?;
     let color = color::quality(&mut scene)?;
@@ -338,9 +339,9 @@ struct LabelMasks {
     found: Vec<bool>,
 }
 
-/// Returns for each label the share of its pixels that the best object of no other label covers.
-/// The share is 1 if the objects are separate, even if no text finds them. Labels that overlap are
-/// not compared. An object that is the best one of two labels separates neither.
+/// Returns for each label the share of its pixels that are not covered by the best object of
+/// another label. The share is 1 if the objects are separate, even if no text finds them. Labels
+/// that overlap are not compared. If two labels have the same best object, it counts against both.
 fn label_separation(best: &[LabelMasks]) -> Vec<f64> {
     let pixels = best.first().map_or(0, |b| b.truth.len());
     let at = |p: usize, mask: fn(&LabelMasks) -> &Vec<bool>| {
@@ -348,11 +349,11 @@ fn label_separation(best: &[LabelMasks]) -> Vec<f64> {
             .filter(|&k| mask(&best[k])[p])
             .collect::<Vec<_>>()
     };
-    let there: Vec<[Vec<usize>; 2]> = (0..pixels)
+    let labels_at_pixels: Vec<[Vec<usize>; 2]> = (0..pixels)
         .into_par_iter()
         .map(|p| [at(p, |b| &b.truth), at(p, |b| &b.found)])
         .collect();
-    let overlapping: BTreeSet<(usize, usize)> = there
+    let overlapping: BTreeSet<(usize, usize)> = labels_at_pixels
         .iter()
         .flat_map(|[truth, _]| {
             truth
@@ -361,7 +362,7 @@ fn label_separation(best: &[LabelMasks]) -> Vec<f64> {
         })
         .collect();
     let mut counts = vec![[0usize; 2]; best.len()];
-    for [truth, found] in &there {
+    for [truth, found] in &labels_at_pixels {
         for &own in truth {
             let is_confused = found
                 .iter()
@@ -396,7 +397,7 @@ fn score_label(
             view.name
         );
     }
-    // The text encoder is loaded once, before the first query is timed.
+    // Loads the text encoder before the query is timed.
     scene.text_query("warm up")?;
     let started = Instant::now();
     let query::Found { ranked, targets } = ObjectQuery::Text(label.category.clone())
@@ -475,9 +476,10 @@ pub fn best_object(grid: &Grid, field: &Field, truth: &[bool]) -> (f64, Vec<bool
 }
 
 /// Returns the five objects with the largest IoU with a mask, counted in one pass over the pixels.
-/// The best object is one of them.
+/// [`best_object`] computes the masks of these objects only, because masks of all objects take
+/// long.
 fn candidates(grid: &Grid, field: &Field, truth: &[bool]) -> Vec<u16> {
-    const MOST: usize = 5;
+    const MAX_CANDIDATES: usize = 5;
     let mut counts = vec![[0usize; 2]; grid.objects.len() + 1];
     let mut inside = truth.iter().map(|inside| usize::from(*inside));
     field.for_each_pixel(grid, |objects| {
@@ -493,7 +495,7 @@ fn candidates(grid: &Grid, field: &Field, truth: &[bool]) -> Vec<u16> {
     };
     let mut ids: Vec<u16> = (1..=grid.objects.len() as u16).collect();
     ids.sort_by(|a, b| iou(b).total_cmp(&iou(a)).then(a.cmp(b)));
-    ids.truncate(MOST);
+    ids.truncate(MAX_CANDIDATES);
     ids
 }
 
@@ -555,7 +557,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn twins_are_apart_where_each_has_its_own_object() {
+    fn labels_with_separate_objects_are_not_confused() {
         let mask = |pixels: &str| pixels.bytes().map(|b| b == b'x').collect::<Vec<_>>();
         let best = |truth: &str, found: &str| LabelMasks {
             truth: mask(truth),

@@ -11,8 +11,8 @@ use std::path::PathBuf;
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Sfm {
-    /// pycolmap, on key points that FastLGS detects and matches; the program `colmap` if it is
-    /// missing.
+    /// pycolmap, on key points that FastLGS detects and matches. If pycolmap is missing, the
+    /// program `colmap`.
     #[default]
     Auto,
     /// The program `colmap` for all steps.
@@ -140,7 +140,7 @@ pub struct PreprocessReport {
     pub photos: usize,
     /// Number of training photos.
     pub training_photos: usize,
-    /// Number of photos without training: held out, or excluded because their poses are wrong.
+    /// Number of photos that are not trained on: held-out photos, and photos with wrong poses.
     pub held_out: usize,
     /// Size of the first prepared photo, as `WIDTHxHEIGHT` in pixels.
     pub size: String,
@@ -186,8 +186,8 @@ pub struct Adjusted {
     pub moved_most: f32,
     /// Mean factor on the focal lengths.
     pub focal: f32,
-    /// Radial term of largest magnitude that the adjustment found in the photos: p maps to p (1 +
-    /// k1 |p|^2).
+    /// Radial term with the largest magnitude that the adjustment found in a photo. It maps p to p
+    /// (1 + k1 |p|^2), where p is in multiples of the focal length.
     pub k1: f32,
     /// Whether the adjusted poses are used.
     pub used: bool,

@@ -68,18 +68,18 @@ pub(super) fn segment(
             config.photos.display()
         );
     }
-    let without: Vec<&str> = training
+    let photos_without_masks: Vec<&str> = training
         .iter()
         .zip(&counts)
         .filter(|(_, c)| c.iter().all(|n| *n == 0))
         .map(|(p, _)| p.camera.name.as_str())
         .collect();
-    if !without.is_empty() && config.eyes.segmenter == SegmenterKind::Import {
+    if !photos_without_masks.is_empty() && config.eyes.segmenter == SegmenterKind::Import {
         run.warn(&format!(
             "{} of {} photos have no mask, or only empty ones: {}",
-            without.len(),
+            photos_without_masks.len(),
             training.len(),
-            without.join(", ")
+            photos_without_masks.join(", ")
         ));
     }
     let mean = |k: usize| counts.iter().map(|c| c[k]).sum::<usize>() as f64 / training.len() as f64;

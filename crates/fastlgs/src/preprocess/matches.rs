@@ -12,9 +12,9 @@ use glam::Vec2;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Matches each photo with its `neighbours` nearest photos, which the given poses decide. Photos in
-/// `lost`, whose poses are wrong, are matched with all others. Matches that contradict the poses
-/// are kept.
+/// Matches each photo with the `neighbours` photos that overlap it most by their poses. Photos in
+/// `lost` have wrong poses and are matched with all others. Matches that contradict the poses are
+/// kept.
 pub(super) fn match_photos(
     photos: &[PreparedPhoto],
     lost: &[usize],
@@ -68,26 +68,26 @@ pub(super) fn consistent_matches(
     cameras: &[Camera],
     points: &[Keypoints],
 ) -> Vec<PairMatches> {
-    let place: BTreeMap<usize, usize> = kept
+    let new_index: BTreeMap<usize, usize> = kept
         .iter()
         .enumerate()
         .map(|(new, old)| (*old, new))
         .collect();
     let renumbered = |m: &PairMatches| {
         Some(PairMatches {
-            a: *place.get(&m.a)?,
-            b: *place.get(&m.b)?,
+            a: *new_index.get(&m.a)?,
+            b: *new_index.get(&m.b)?,
             pairs: m.pairs.clone(),
         })
     };
-    let obeying = |m: PairMatches| m.obeying(cameras, points, tracks::TOLERANCE);
+    let obeying = |m: PairMatches| m.inliers(cameras, points, tracks::TOLERANCE);
     matches.iter().filter_map(renumbered).map(obeying).collect()
 }
 
 /// Matches the same pairs of photos again along the epipolar lines of their poses. The result is
-/// for points and masks. It cannot verify poses, because every match on an epipolar line agrees
-/// with them.
-pub(super) fn guided(
+/// used for points and masks. It cannot verify poses, because every match on an epipolar line
+/// agrees with them.
+pub(super) fn match_along_epipolar_lines(
     matches: &[PairMatches],
     cameras: &[Camera],
     points: &[Keypoints],
@@ -102,22 +102,22 @@ pub(super) fn guided(
     matches.par_iter().map(match_pair).collect()
 }
 
-/// Least number of matches with another photo; a photo with fewer counts as isolated.
+/// A photo is isolated if it has fewer matches than this with every other photo.
 const MIN_MATCHES: usize = 15;
 
 /// Returns a warning if photos overlap with no other photo, else `None`. It names the isolated
 /// photo with the largest angle to its nearest photo.
-pub(super) fn warn_of_gaps(cameras: &[Camera], matches: &[PairMatches]) -> Option<String> {
+pub(super) fn gap_warning(cameras: &[Camera], matches: &[PairMatches]) -> Option<String> {
     let mut most = vec![0; cameras.len()];
     for m in matches {
         [m.a, m.b]
             .into_iter()
             .for_each(|photo| most[photo] = most[photo].max(m.pairs.len()));
     }
-    let alone: Vec<usize> = (0..cameras.len())
+    let isolated: Vec<usize> = (0..cameras.len())
         .filter(|&photo| most[photo] < MIN_MATCHES)
         .collect();
-    let turned = |a: usize, b: usize| {
+    let angle_between = |a: usize, b: usize| {
         cameras[a]
             .forward()
             .angle_between(cameras[b].forward())
@@ -125,17 +125,18 @@ pub(super) fn warn_of_gaps(cameras: &[Camera], matches: &[PairMatches]) -> Optio
     };
     let gap = |&photo: &usize| {
         let others = (0..cameras.len()).filter(|other| *other != photo);
-        let nearest = others.min_by(|a, b| turned(photo, *a).total_cmp(&turned(photo, *b)))?;
-        Some((photo, nearest, turned(photo, nearest)))
+        let nearest =
+            others.min_by(|a, b| angle_between(photo, *a).total_cmp(&angle_between(photo, *b)))?;
+        Some((photo, nearest, angle_between(photo, nearest)))
     };
-    let (photo, nearest, degrees) = alone
+    let (photo, nearest, degrees) = isolated
         .iter()
         .filter_map(gap)
         .max_by(|a, b| a.2.total_cmp(&b.2))?;
     Some(format!(
         "{} of {} photos overlap too little with any other to reconstruct shapes; the largest gap is {degrees:.0} degrees, from {} to {}: \
          take photos between them",
-        alone.len(),
+        isolated.len(),
         cameras.len(),
         cameras[photo].name,
         cameras[nearest].name
@@ -143,7 +144,7 @@ pub(super) fn warn_of_gaps(cameras: &[Camera], matches: &[PairMatches]) -> Optio
 }
 
 /// Counts the key point matches between the masks of matched photos (level whole).
-pub(super) fn between_masks(
+pub(super) fn count_mask_pairs(
     folder: &SceneFolder,
     cameras: &[Camera],
     points: &[Keypoints],
@@ -208,14 +209,14 @@ mod tests {
             b,
             pairs: vec![(0, 0); count],
         };
-        let warning = warn_of_gaps(&cameras, &[shared(0, 1, 80), shared(1, 2, 4)]).unwrap();
+        let warning = gap_warning(&cameras, &[shared(0, 1, 80), shared(1, 2, 4)]).unwrap();
         assert!(
             warning.starts_with("1 of 3 photos")
                 && warning.contains("50 degrees, from 60.png to 10.png"),
             "{warning}"
         );
         assert_eq!(
-            warn_of_gaps(&cameras, &[shared(0, 1, 80), shared(1, 2, 40)]),
+            gap_warning(&cameras, &[shared(0, 1, 80), shared(1, 2, 40)]),
             None
         );
     }

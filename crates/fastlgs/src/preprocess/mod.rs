@@ -117,7 +117,7 @@ pub(crate) fn preprocess_locked(
         .map(|camera| SceneFolder::objects_name(&camera.name));
     staged.publish(&scene, &REPLACED, maps, &manifest)?;
     // Checkpoints of a training on other photos are invalid.
-    checkpoints::forget(&scene);
+    checkpoints::remove_all(&scene);
     stage.cache.tidy();
     let cameras = &placed.cameras;
     let cached = stage.cache.counts().into_iter();
@@ -229,8 +229,8 @@ struct Placed {
     matches: Vec<PairMatches>,
 }
 
-/// What the training photos show together.
-struct Found {
+/// Results that are computed from all training photos together.
+struct TrainingData {
     /// Cameras of the training photos.
     cameras: Vec<Camera>,
     brightness: Brightness,
@@ -238,7 +238,7 @@ struct Found {
     key_point_matches: usize,
 }
 
-/// What all steps share.
+/// Options and state that all steps share.
 struct Stage<'a> {
     config: &'a PreprocessConfig,
     run: &'a Run<'a>,
@@ -255,7 +255,8 @@ impl Stage<'_> {
         let photos = &self.config.photos;
         let lacks_poses = dataset::images_folder(photos).is_some() && !dataset::has_poses(photos);
         let mut dataset = if lacks_poses {
-            let found = poses::find(photos, &self.folder, &self.cache, self.config.sfm, self.run)?;
+            let found =
+                poses::compute_poses(photos, &self.folder, &self.cache, self.config.sfm, self.run)?;
             self.laps.end("poses");
             found
         } else {
@@ -269,7 +270,7 @@ impl Stage<'_> {
         Ok(dataset)
     }
 
-    /// Writes the prepared photos, and settles the convention of the poses.
+    /// Writes the prepared photos, and determines the convention of the poses.
     fn prepare_photos(&mut self, dataset: &mut Dataset) -> Result<Vec<PreparedPhoto>> {
         let (config, run) = (self.config, self.run);
         let mut photos = photos::load(dataset, config, &self.folder, &self.cache, run)?;
@@ -287,13 +288,13 @@ impl Stage<'_> {
         let mut checked = PoseCheckReport::default();
         if config.poses != Poses::Keep {
             checked = poses::check(photos, &self.folder, &self.cache, run, warnings)?;
-            poses::leave_out_lost(photos, &self.cache, &mut checked)?;
+            poses::mark_unsupported_outliers(photos, &self.cache, &mut checked)?;
         }
         self.laps.end("pose_check");
         let lost = &checked.contradictory;
         let matches = matches::match_photos(photos, lost, config.neighbours, &self.cache, run)?;
         self.laps.end("matches");
-        poses::place(photos, &mut checked, &matches);
+        poses::resect_contradictory(photos, &mut checked, &matches);
         poses::warn(photos, &checked, run, warnings);
         let adjusted = match config.poses {
             Poses::Keep => None,
@@ -325,7 +326,7 @@ impl Stage<'_> {
             held_out_views,
             segmenter: self.config.eyes.segmenter.name().to_owned(),
             encoder: self.config.eyes.encoder.name().to_owned(),
-            crops: calibrations::word_of(calibrations::best_background(&models.files)),
+            crops: calibrations::background_name(calibrations::best_background(&models.files)),
             models: models.files.clone(),
             seed: self.run.seed,
             warnings: Vec::new(),
@@ -337,20 +338,20 @@ impl Stage<'_> {
         }
     }
 
-    /// Writes first points and pairs of masks, and compares the brightness of the photos. `kept`
-    /// has the index of each training photo among all photos.
+    /// Writes the initial points and the key point matches between masks, and compares the
+    /// brightness of the photos. `kept` has the index of each training photo among all photos.
     fn find_points(
         &mut self,
         kept: &[usize],
         training: Vec<PreparedPhoto>,
         placed: &Placed,
         dataset: &Dataset,
-    ) -> Result<Found> {
+    ) -> Result<TrainingData> {
         let cameras: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
         let (keypoints, colors): (Vec<Keypoints>, Vec<_>) =
             training.into_iter().map(|p| (p.points, p.colors)).unzip();
         let matches = matches::consistent_matches(kept, &placed.matches, &cameras, &keypoints);
-        if let Some(warning) = matches::warn_of_gaps(&cameras, &matches) {
+        if let Some(warning) = matches::gap_warning(&cameras, &matches) {
             self.run.warn(&warning);
             self.warnings.push(warning);
         }
@@ -360,7 +361,7 @@ impl Stage<'_> {
             spread_stops: compared.spread_stops,
             gains: names.zip(compared.gains).collect(),
         };
-        let matches = matches::guided(&matches, &cameras, &keypoints);
+        let matches = matches::match_along_epipolar_lines(&matches, &cameras, &keypoints);
         let tracks = tracks::tracks(&cameras, &keypoints, &matches, tracks::TOLERANCE);
         // Given points are valid only for the given poses.
         let poses_are_given =
@@ -378,10 +379,10 @@ impl Stage<'_> {
         drop(work);
         self.laps.end("depths");
         folder.save_points(&points)?;
-        let pairs = matches::between_masks(folder, &cameras, &keypoints, &matches)?;
+        let pairs = matches::count_mask_pairs(folder, &cameras, &keypoints, &matches)?;
         evidence::save_pairs(folder, &pairs)?;
         self.laps.end("points");
-        Ok(Found {
+        Ok(TrainingData {
             cameras,
             brightness,
             points: points.len(),
@@ -416,8 +417,9 @@ fn training_photos(
     Ok((kept, training))
 }
 
-/// Returns which views are held out: N for every N-th (0 for none), and names of views. Names come
-/// from `holdout_labels`, else from the data set if it marks views for testing.
+/// Returns which views are held out: N if every N-th view is (0 for none), and the names of further
+/// views. The names come from `holdout_labels`, else from the data set if it marks views for
+/// testing.
 ///
 /// # Errors
 /// A labelled view is not among the photos.

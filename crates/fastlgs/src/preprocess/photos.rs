@@ -25,13 +25,13 @@ pub struct Photo {
     pub pixels: RgbImage,
     /// Alpha channel, if the photo has one: 0 is transparent, 255 is opaque.
     alpha: Option<GrayImage>,
-    /// Mask of the pixels that count: those below 128 are ignored.
+    /// Mask of the pixels that count. Pixels with values below 128 are ignored.
     ignore: Option<GrayImage>,
     /// Share of the photo that its mask file keeps; `None` without a mask file.
     mask_extent: Option<Extent>,
 }
 
-/// Share of the pixels of a photo that a mask covers.
+/// Whether a mask covers no pixel, some pixels, or all pixels of a photo.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Extent {
     Nothing,
@@ -55,10 +55,10 @@ pub(super) struct PreparedPhoto {
     pub camera: Camera,
     /// Fingerprint of the pixels.
     pub key: Key,
-    impression: PhotoStats,
+    stats: PhotoStats,
     /// Share of the photo that its mask file keeps; `None` without a mask file.
-    drawn: Option<Extent>,
-    /// Share of the photo that is not fully transparent.
+    mask_extent: Option<Extent>,
+    /// Extent of the pixels that are not fully transparent.
     opaque: Extent,
     pub points: Keypoints,
     /// Colour at each key point.
@@ -69,7 +69,7 @@ pub(super) struct PreparedPhoto {
 
 /// Warns about blurred and repeated photos, which are used nevertheless.
 pub(super) fn warn_of_bad_photos(photos: &[PreparedPhoto], run: &Run, warnings: &mut Vec<String>) {
-    let seen: Vec<PhotoStats> = photos.iter().map(|p| p.impression.clone()).collect();
+    let seen: Vec<PhotoStats> = photos.iter().map(|p| p.stats.clone()).collect();
     for (list, what) in [
         (photo_quality::blurred(&seen), "are blurred"),
         (
@@ -97,22 +97,25 @@ pub(super) fn warn_of_bad_photos(photos: &[PreparedPhoto], run: &Run, warnings: 
 /// Checks the masks and alpha channels of the photos. Warns if only some of them are unusable.
 ///
 /// # Errors
-/// The mask files ignore every pixel of all photos that have one, or no pixel of them; or all
-/// photos are fully transparent.
+/// All mask files ignore every pixel, or all mask files ignore no pixel, or all photos are fully
+/// transparent.
 pub(super) fn check_masks(
     photos: &[PreparedPhoto],
     run: &Run,
     warnings: &mut Vec<String>,
 ) -> Result<()> {
-    let masked: Vec<&PreparedPhoto> = photos.iter().filter(|p| p.drawn.is_some()).collect();
-    let leaving = |extent| {
+    let masked: Vec<&PreparedPhoto> = photos.iter().filter(|p| p.mask_extent.is_some()).collect();
+    let names_with_extent = |extent| {
         masked
             .iter()
-            .filter(|p| p.drawn == Some(extent))
+            .filter(|p| p.mask_extent == Some(extent))
             .map(|p| p.camera.name.as_str())
             .collect::<Vec<_>>()
     };
-    let (nothing, everything) = (leaving(Extent::Nothing), leaving(Extent::Everything));
+    let (nothing, everything) = (
+        names_with_extent(Extent::Nothing),
+        names_with_extent(Extent::Everything),
+    );
     let transparent: Vec<&str> = photos
         .iter()
         .filter(|p| p.opaque == Extent::Nothing)
@@ -167,7 +170,7 @@ pub(super) fn color_points(
     photos: &[PreparedPhoto],
     folder: &SceneFolder,
 ) -> Result<()> {
-    if dataset.shown_in.is_empty() {
+    if dataset.track_photos.is_empty() {
         return Ok(());
     }
     let mut sums = vec![[0u32; 4]; dataset.points.len()];
@@ -178,7 +181,7 @@ pub(super) fn color_points(
             .points
             .iter()
             .zip(&mut sums)
-            .zip(&dataset.shown_in)
+            .zip(&dataset.track_photos)
             .filter(|(_, list)| shows(list))
             .map(|p| p.0)
         {
@@ -219,10 +222,10 @@ pub(super) fn load(
         .map(|p| u64::from(p.camera.width) * u64::from(p.camera.height))
         .max()
         .unwrap_or(1);
-    let together = (config.memory / (BYTES_A_PIXEL * largest.max(1))).clamp(1, 256) as usize;
+    let batch_size = (config.memory / (BYTES_A_PIXEL * largest.max(1))).clamp(1, 256) as usize;
     let mut photos = Vec::with_capacity(dataset.photos.len());
-    for some in dataset.photos.chunks(together) {
-        let loaded: Vec<Result<PreparedPhoto>> = some
+    for batch in dataset.photos.chunks(batch_size) {
+        let loaded: Vec<Result<PreparedPhoto>> = batch
             .par_iter()
             .map(|posed| {
                 let photo = load_photo(posed, config.max_side)?;
@@ -276,8 +279,8 @@ fn prepare(
     };
     let colors = points.positions.iter().map(color).collect();
     Ok(PreparedPhoto {
-        impression: PhotoStats::of(&pixels),
-        drawn,
+        stats: PhotoStats::of(&pixels),
+        mask_extent: drawn,
         opaque,
         camera,
         key,
@@ -332,7 +335,7 @@ pub(super) fn remove_distortion(
             known_mask(folder.ignore_path(&camera.name))?,
         );
         let mask = |mask: &GrayImage| undistort_gray(mask, &camera, &lens);
-        let ignore = in_both(ignore.as_ref().map(mask), coverage_mask(&camera, &lens));
+        let ignore = intersect_masks(ignore.as_ref().map(mask), coverage_mask(&camera, &lens));
         let color = |photo: &RgbImage| undistort(photo, &camera, &lens);
         let (pixels, alpha) = resampled(&folder.photo(&camera.name)?, alpha.as_ref(), color, mask);
         (known.key, known.removed_k1) = (fingerprint(&camera, &pixels), k1);
@@ -347,15 +350,15 @@ pub(super) fn remove_distortion(
                 pixels,
                 alpha,
                 ignore,
-                mask_extent: known.drawn,
+                mask_extent: known.mask_extent,
             },
             folder,
         )
     })
 }
 
-/// Returns the pixels that count in both masks (the smaller value), or the only mask there is.
-fn in_both(one: Option<GrayImage>, other: Option<GrayImage>) -> Option<GrayImage> {
+/// Returns the smaller value of two masks at each pixel. If only one mask exists, returns that.
+fn intersect_masks(one: Option<GrayImage>, other: Option<GrayImage>) -> Option<GrayImage> {
     match (one, other) {
         (Some(mut one), Some(other)) => {
             one.pixels_mut()
@@ -367,25 +370,26 @@ fn in_both(one: Option<GrayImage>, other: Option<GrayImage>) -> Option<GrayImage
     }
 }
 
-/// Loads a photo, scales it to at most `max_side` pixels and undistorts it. Undistorting last is
-/// cheaper, and distortion does not depend on scale.
+/// Loads a photo, scales it to at most `max_side` pixels and undistorts it. Scaling comes first,
+/// because undistorting fewer pixels is faster and distortion does not depend on scale.
 ///
 /// # Errors
 /// The photo or its mask cannot be read, or its proportions differ from those of its camera.
 pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
-    let way_up = if posed.upright {
+    let orientation_rule = if posed.upright {
         OrientationRule::Upright
     } else {
         OrientationRule::AsPosed(posed.camera.width, posed.camera.height)
     };
-    let image_io::Photo { pixels: raw, alpha } = image_io::load_photo(&posed.path, way_up)?;
+    let image_io::Photo { pixels: raw, alpha } =
+        image_io::load_photo(&posed.path, orientation_rule)?;
     // The size of the file is authoritative: some tools scale photos and keep the file of the
     // poses.
     let camera = posed
         .camera
         .resized(raw.width(), raw.height())
         .shrunk_to(max_side);
-    if !is_alike(raw.dimensions(), (posed.camera.width, posed.camera.height)) {
+    if !has_same_proportions(raw.dimensions(), (posed.camera.width, posed.camera.height)) {
         bail!(
             "{}: the photo is {}x{}, but its camera is {}x{}; check whether it was rotated or cropped after the poses were computed",
             posed.path.display(),
@@ -414,7 +418,7 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
     let (mut ignore, mut drawn) = (None, None);
     if let Some(path) = &posed.ignore {
         let own = MaskImage::load(path)?;
-        if !is_alike((own.width, own.height), raw.dimensions()) {
+        if !has_same_proportions((own.width, own.height), raw.dimensions()) {
             let (width, height) = raw.dimensions();
             bail!(
                 "{}: the mask is {}x{}, but its photo is {width}x{height}; check whether it was rotated or cropped",
@@ -426,7 +430,7 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
         drawn = Some(Extent::of(own.area(), own.inside.len()));
         ignore = Some(mask(&own.to_gray()));
     }
-    let ignore = in_both(ignore, coverage_mask(&camera, &posed.distortion));
+    let ignore = intersect_masks(ignore, coverage_mask(&camera, &posed.distortion));
     Ok(Photo {
         pixels,
         alpha,
@@ -437,7 +441,7 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
 }
 
 /// Returns whether two sizes have the same proportions within 2 %, which allows for rounding.
-fn is_alike((w, h): (u32, u32), (width, height): (u32, u32)) -> bool {
+fn has_same_proportions((w, h): (u32, u32), (width, height): (u32, u32)) -> bool {
     (f64::from(w) / f64::from(h) * f64::from(height) / f64::from(width) - 1.0).abs() <= 0.02
 }
 
@@ -452,16 +456,16 @@ fn resampled(
     let Some(alpha) = alpha else {
         return (color(pixels), None);
     };
-    let times = |photo: &mut RgbImage, alpha: &GrayImage, factor: fn(f32) -> f32| {
+    let scale_by_alpha = |photo: &mut RgbImage, alpha: &GrayImage, factor: fn(f32) -> f32| {
         for (pixel, covered) in photo.pixels_mut().zip(alpha.pixels()) {
             let factor = factor(f32::from(covered[0]) / 255.0);
             pixel.0 = pixel.0.map(|v| (f32::from(v) * factor + 0.5) as u8);
         }
     };
     let mut weighted = pixels.clone();
-    times(&mut weighted, alpha, |covered| covered);
+    scale_by_alpha(&mut weighted, alpha, |covered| covered);
     let (mut pixels, alpha) = (color(&weighted), mask(alpha));
-    times(&mut pixels, &alpha, |covered| {
+    scale_by_alpha(&mut pixels, &alpha, |covered| {
         if covered > 0.0 { 1.0 / covered } else { 0.0 }
     });
     (pixels, Some(alpha))
@@ -517,7 +521,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_transparent_has_no_colour_to_mix_in() {
+    fn transparent_pixels_do_not_darken_opaque_ones() {
         // The left half is white. The right half is transparent and black, as files store it.
         let pixels = RgbImage::from_fn(6, 2, |x, _| Rgb([if x < 3 { 255 } else { 0 }; 3]));
         let alpha = GrayImage::from_fn(6, 2, |x, _| Luma([if x < 3 { 255 } else { 0 }]));

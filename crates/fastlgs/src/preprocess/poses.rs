@@ -31,7 +31,7 @@ fn pose_tool(sfm: Sfm) -> Result<Tool> {
 ///
 /// # Errors
 /// No tool is installed, it fails or places no photo, or the run is cancelled.
-pub(super) fn find(
+pub(super) fn compute_poses(
     photos: &Path,
     folder: &SceneFolder,
     cache: &Cache,
@@ -300,9 +300,10 @@ fn wrong_pose_count(report: &pose_check::PoseCheckReport) -> usize {
 }
 
 /// Computes all poses again with the given intrinsics, because correcting many wrong poses one by
-/// one seldom works. The result is in the frame of the given poses that were right.
+/// one seldom works. The result is in the coordinate system of the given poses that were correct.
 ///
-/// Returns `None` unless fewer of the new poses contradict the photos, and no more photos are lost.
+/// Returns `None` if the new poses are not better: not fewer of them contradict the photos, or more
+/// photos have no pose.
 fn recompute_poses(
     given: &[Camera],
     points: &[Keypoints],
@@ -315,10 +316,11 @@ fn recompute_poses(
     };
     let work = run.work("poses anew", 0);
     let files: Vec<PathBuf> = given.iter().map(|c| folder.photo_path(&c.name)).collect();
-    let say = |stage: &str, line: &str| report_line(&work, stage, line);
+    let on_line = |stage: &str, line: &str| report_line(&work, stage, line);
     let partial = folder.root.join(PARTIAL);
-    let found =
-        structure::reconstruct_with_lenses(&python, &files, given, points, &partial, run.seed, say);
+    let found = structure::reconstruct_with_lenses(
+        &python, &files, given, points, &partial, run.seed, on_line,
+    );
     let _ = std::fs::remove_dir_all(&partial);
     work.check()?;
     let found = found?;
@@ -330,19 +332,19 @@ fn recompute_poses(
     let lost: BTreeSet<usize> = unplaced
         .chain(again.contradictory.iter().copied())
         .collect();
-    let doubted_now = lost
+    let wrong_now = lost
         .iter()
         .chain(&again.moved)
         .collect::<BTreeSet<_>>()
         .len();
     tracing::info!(
         doubted = wrong_pose_count(checked),
-        doubted_now,
+        wrong_now,
         lost = lost.len(),
         "all poses were computed again"
     );
-    // Corrected photos are trained on, lost ones are not.
-    if doubted_now >= wrong_pose_count(checked) || lost.len() > checked.contradictory.len() {
+    // Training uses photos with corrected poses, but not photos without a pose.
+    if wrong_now >= wrong_pose_count(checked) || lost.len() > checked.contradictory.len() {
         return Ok(None);
     }
     moved.extend(again.moved);
@@ -356,13 +358,13 @@ fn recompute_poses(
     )))
 }
 
-/// A photo supports the pose of another one with at least this many matches, of which more than
-/// this share agrees with the pose.
+/// Conditions under which a photo supports the pose of another one: least number of matches, and
+/// the share of them that must agree with the pose.
 const SUPPORT: (usize, f32) = (15, 0.5);
 
 /// Marks photos as contradictory whose cameras lie far outside of all others, and whose poses no
 /// other photo supports.
-pub(super) fn leave_out_lost(
+pub(super) fn mark_unsupported_outliers(
     photos: &[PreparedPhoto],
     cache: &Cache,
     checked: &mut pose_check::PoseCheckReport,
@@ -383,7 +385,7 @@ pub(super) fn leave_out_lost(
                 pairs: super::matches::cached_matches(photos, a, b, cache)?,
             };
             let obeying = found
-                .obeying(&cameras, &points, tracks::TOLERANCE)
+                .inliers(&cameras, &points, tracks::TOLERANCE)
                 .pairs
                 .len();
             supported |= found.pairs.len() >= SUPPORT.0
@@ -400,7 +402,7 @@ pub(super) fn leave_out_lost(
 
 /// Computes the poses of contradictory photos by resection from matched key points, and updates
 /// `checked`.
-pub(super) fn place(
+pub(super) fn resect_contradictory(
     photos: &mut [PreparedPhoto],
     checked: &mut pose_check::PoseCheckReport,
     matches: &[PairMatches],
@@ -474,7 +476,7 @@ fn detect_small(folder: &SceneFolder, cameras: &[Camera], run: &Run) -> Result<V
 /// cube of their number.
 const MAX_ADJUSTED_PHOTOS: usize = 600;
 /// Displacement at the corners, in pixels, above which a found distortion is removed from the
-/// photos. Resampling reduces sharpness.
+/// photos. A smaller distortion stays, because resampling reduces sharpness.
 const MAX_CORNER_SHIFT: f32 = 1.0;
 /// Adjusted poses are used if the reprojection error falls below this share of its old value. The
 /// error of exact poses falls slightly, too, because adjustment also fits the noise of key points.
@@ -534,9 +536,8 @@ pub(super) fn adjust(
     if used && bent > MAX_CORNER_SHIFT {
         super::photos::remove_distortion(photos, &report.k1, folder)?;
         let warning = format!(
-            "the lens distorts the photos by {bent:.1} pixels at their corners, which the given poses do not state; the photos were straightened \
-             (\"k1\": {k1:.4} in transforms.json, or a radial term in COLMAP's camera model, removes it at full size; labels drawn on the photos are \
-             not straightened)"
+            "the lens distorts the photos by {bent:.1} pixels at their corners, but the input states no such distortion; the photos were straightened, labels \
+             drawn on them were not; to remove the distortion at full size, add \"k1\": {k1:.4} to transforms.json, or a radial term to COLMAP's camera model"
         );
         run.warn(&warning);
         warnings.push(warning);

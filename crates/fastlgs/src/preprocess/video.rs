@@ -66,11 +66,11 @@ pub(super) fn photos(video: &Path, folder: &SceneFolder, run: &Run) -> Result<Pa
     let _ = std::fs::remove_dir_all(&partial);
     std::fs::create_dir_all(&partial).map_err(fastlgs_core::Error::io(&partial))?;
     let work = run.work("frames", 0);
-    let looked = |seconds: f64, chosen: usize| {
+    let on_frame = |seconds: f64, chosen: usize| {
         work.set_activity(&format!("{seconds:.0} s, {chosen} photos"));
         work.check()
     };
-    let made = fastlgs_sfm::video::photos(video, &partial.join("images"), looked);
+    let made = fastlgs_sfm::video::photos(video, &partial.join("images"), on_frame);
     let made = made.and_then(|_| {
         let names = partial
             .join("images")

@@ -59,7 +59,7 @@ pub struct AnswerReport {
 }
 
 impl AnswerReport {
-    /// Sets `most_visible_view` if this view shows fewer than 30 pixels of the answer.
+    /// Sets `seen_best` if this view shows fewer than 30 pixels of the answer.
     ///
     /// # Errors
     /// The device fails.
@@ -271,7 +271,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_of_different_questions_have_different_names() {
+    fn different_queries_have_different_file_names() {
         assert_eq!(
             [
                 file_name("fox"),

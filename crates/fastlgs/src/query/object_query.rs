@@ -55,7 +55,7 @@ impl ObjectQuery {
         Ok(match self {
             Self::Point(pixels) => EmbeddedQuery::Point(pixels.clone()),
             Self::Image(name, photo) => {
-                let whole = picture(scene, name, photo)?;
+                let whole = picture_query(scene, name, photo)?;
                 let whole = if negatives.is_empty() {
                     whole
                 } else {
@@ -107,7 +107,7 @@ impl Embedded {
         } else {
             plain.as_str()
         };
-        let split = part_of(text).filter(|_| !texts.is_taught(text));
+        let split = split_part_and_object(text).filter(|_| !texts.is_taught(text));
         // Only the whole phrase is used if a part cannot be embedded. A taught name, for example,
         // cannot be compared with a text as negative.
         let split =
@@ -120,18 +120,18 @@ impl Embedded {
 
     /// Ranks all objects and selects the targets.
     pub fn find(&self, grid: &Grid, config: &QueryConfig) -> Found {
-        let by = |query: &TextQuery| {
+        let answer_to = |query: &TextQuery| {
             let ranked = query::rank(grid, query);
             Found {
                 targets: query::select(grid, &ranked, query, config),
                 ranked,
             }
         };
-        let whole = by(&self.phrase_query);
+        let whole = answer_to(&self.phrase_query);
         let Some([object, part]) = &self.split else {
             return whole;
         };
-        let object_answer = by(object);
+        let object_answer = answer_to(object);
         match query::part(grid, &object_answer.targets, part, config) {
             Some(part) if query::best_score(&part.ranked) > query::best_score(&whole.ranked) => {
                 part
@@ -144,7 +144,7 @@ impl Embedded {
 
 /// Splits "A of B" into part A and object B, without the article of B. "flower pot of the bonsai"
 /// gives "flower pot" and "bonsai".
-fn part_of(text: &str) -> Option<(&str, &str)> {
+fn split_part_and_object(text: &str) -> Option<(&str, &str)> {
     let (part, object) = text.split_once(" of ")?;
     let object = ["the ", "a ", "an "]
         .iter()
@@ -159,7 +159,7 @@ fn part_of(text: &str) -> Option<(&str, &str)> {
 /// # Errors
 /// The encoder of the scene cannot embed pictures, or its embeddings do not fit those of the
 /// objects.
-pub(crate) fn picture(scene: &Scene, name: &str, photo: &RgbImage) -> Result<TextQuery> {
+pub(crate) fn picture_query(scene: &Scene, name: &str, photo: &RgbImage) -> Result<TextQuery> {
     let (width, height) = photo.dimensions();
     let everything = LabelMap {
         width,
@@ -216,7 +216,7 @@ impl EmbeddedQuery {
                         camera.height
                     );
                 }
-                let (at_pixels, meant) =
+                let (at_pixels, selected) =
                     query::select_at_pixels(grid, &field.at(grid, pixels.all()));
                 let hit = |id: u16| Hit {
                     id,
@@ -224,7 +224,7 @@ impl EmbeddedQuery {
                 };
                 Ok(Found {
                     ranked: at_pixels.into_iter().map(hit).collect(),
-                    targets: meant.map(hit).into_iter().collect(),
+                    targets: selected.map(hit).into_iter().collect(),
                 })
             }
         }
@@ -236,13 +236,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn parts_are_named_by_of() {
+    fn a_of_b_is_split_into_part_and_object() {
         assert_eq!(
-            part_of("flower pot of the bonsai"),
+            split_part_and_object("flower pot of the bonsai"),
             Some(("flower pot", "bonsai"))
         );
-        assert_eq!(part_of("wheel of a bicycle"), Some(("wheel", "bicycle")));
-        assert_eq!(part_of("fox"), None);
-        assert_eq!(part_of("top of "), None);
+        assert_eq!(
+            split_part_and_object("wheel of a bicycle"),
+            Some(("wheel", "bicycle"))
+        );
+        assert_eq!(split_part_and_object("fox"), None);
+        assert_eq!(split_part_and_object("top of "), None);
     }
 }

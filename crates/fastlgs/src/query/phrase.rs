@@ -13,7 +13,7 @@ fn is_invisible(c: char) -> bool {
 
 /// Returns whether a character separates words: white space, control character, quote, bracket,
 /// hyphen, dash or underscore.
-fn separates(c: char) -> bool {
+fn is_separator(c: char) -> bool {
     c.is_whitespace()
         || c.is_control()
         || "\"`\u{b4}\u{ab}\u{bb}()[]{}<>-_\u{2010}\u{2011}\u{2012}\u{2013}\u{2014}\u{2015}\u{2212}"
@@ -35,7 +35,7 @@ pub fn normalised(text: &str) -> String {
         // Between letters or digits it is an apostrophe.
         '\'' | '\u{2019}' if letter(k.checked_sub(1)) && letter(Some(k + 1)) => '\'',
         '\'' => ' ',
-        c if separates(*c) => ' ',
+        c if is_separator(*c) => ' ',
         c => *c,
     };
     let spaced: String = characters.iter().enumerate().map(plain).collect();
@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_same_words_are_the_same_text() {
+    fn spellings_of_the_same_words_are_normalised_to_one_text() {
         for text in [
             "red bottle",
             "a red bottle",

@@ -94,7 +94,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pixels_are_read_and_named() {
+    fn pixels_are_parsed_and_formatted() {
         let read = |text: &str| text.parse::<Pixels>();
         assert_eq!(read("120,45"), Ok(Pixels(vec![(120, 45)])));
         assert_eq!(

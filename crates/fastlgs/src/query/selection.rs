@@ -9,7 +9,7 @@ use fastlgs_grid::Grid;
 use glam::Vec3;
 use std::path::Path;
 
-/// Returns the indices of all Gaussians that belong to some objects.
+/// Returns the indices of all Gaussians that belong to at least one of `objects`.
 pub fn gaussians(scene: &Gaussians, grid: &Grid, objects: &[u16]) -> Vec<usize> {
     let members = grid.members(objects);
     let ids = scene.object_ids.iter().enumerate();
@@ -18,7 +18,8 @@ pub fn gaussians(scene: &Gaussians, grid: &Grid, objects: &[u16]) -> Vec<usize> 
         .collect()
 }
 
-/// Writes the selected Gaussians (`keep`), or all others, in the format of the file extension.
+/// Writes Gaussians in the format of the file extension: with `keep`, those with the indices
+/// `selected`, else all others.
 ///
 /// # Errors
 /// No Gaussians are left, the extension is unknown, or the file cannot be written.
@@ -29,9 +30,11 @@ pub fn export(
     selected: &[usize],
     keep: bool,
 ) -> Result<()> {
-    let mut inside = vec![false; scene.len()];
-    selected.iter().for_each(|&i| inside[i] = true);
-    let indices: Vec<usize> = (0..inside.len()).filter(|&i| inside[i] == keep).collect();
+    let mut is_selected = vec![false; scene.len()];
+    selected.iter().for_each(|&i| is_selected[i] = true);
+    let indices: Vec<usize> = (0..is_selected.len())
+        .filter(|&i| is_selected[i] == keep)
+        .collect();
     if indices.is_empty() {
         bail!(
             "{}: no Gaussians are left to write; change the selection",
@@ -65,8 +68,8 @@ impl World {
 }
 
 /// Writes Gaussians in world coordinates, in the format of the file extension ([`EXTENSIONS`]). SPZ
-/// and SOG have few bits for a coordinate: they hold scene coordinates, without distant outliers,
-/// and warnings report this.
+/// and SOG have few bits for a coordinate, so they get scene coordinates without distant outliers.
+/// Warnings report both.
 ///
 /// # Errors
 /// An unknown extension, or a file that cannot be written.
@@ -104,16 +107,20 @@ fn for_low_precision(path: &Path, gaussians: &Gaussians, frame: &WorldFrame) -> 
     written
 }
 
-/// Returns the minimum and maximum corner of the Gaussians `own`, in world coordinates; `None` if
-/// there are none. Corners are the 2nd and 98th percentiles of the centres, so that floaters do not
-/// enlarge the box.
-pub fn robust_box(scene: &Gaussians, frame: &WorldFrame, own: &[usize]) -> Option<[[f64; 3]; 2]> {
-    if own.is_empty() {
+/// Returns the minimum and maximum corner of the Gaussians with these indices, in world
+/// coordinates; `None` if there are none. Corners are the 2nd and 98th percentiles of the centres,
+/// so that floaters do not enlarge the box.
+pub fn robust_box(
+    scene: &Gaussians,
+    frame: &WorldFrame,
+    indices: &[usize],
+) -> Option<[[f64; 3]; 2]> {
+    if indices.is_empty() {
         return None;
     }
     let mut out = [[0.0; 3]; 2];
     for k in 0..3 {
-        let mut values: Vec<f32> = own.iter().map(|&i| scene.means[i][k]).collect();
+        let mut values: Vec<f32> = indices.iter().map(|&i| scene.means[i][k]).collect();
         values.sort_by(f32::total_cmp);
         out[0][k] = values[values.len() * 2 / 100];
         out[1][k] = values[(values.len() - 1) * 98 / 100];

@@ -29,7 +29,7 @@ impl Tile {
 
 /// Returns the tiles of a view: its photo if there is one, the render, and the object map.
 pub fn view_tiles(
-    session: &Scene,
+    scene: &Scene,
     grid: &Grid,
     camera: &Camera,
     frame: &Frame,
@@ -41,7 +41,7 @@ pub fn view_tiles(
         Rgb(turbo::id_color(owners.at(x, y)))
     });
     let render = image_io::from_planar(frame.color(), frame.width, frame.height);
-    let photo = session
+    let photo = scene
         .folder()
         .photo(&camera.name)
         .ok()
@@ -60,7 +60,9 @@ const GAP: u32 = 10;
 const FONT_SIZES: [f32; 2] = [19.0, 15.0];
 /// Height of the text below an image, in pixels.
 const TEXT_HEIGHT: u32 = 48;
+/// Colour of the background.
 const PAPER: Rgb<u8> = Rgb([255; 3]);
+/// Colours of title and note.
 const INK: [Rgb<u8>; 2] = [Rgb([20; 3]), Rgb([90; 3])];
 
 /// Arranges tiles in rows of `columns` tiles.
@@ -122,11 +124,18 @@ fn fitted(picture: &RgbImage) -> RgbImage {
 
 /// Draws a line of text with its baseline starting at `base` (x, y). Text beyond `room` pixels is
 /// cut off.
-fn draw_text(page: &mut RgbImage, words: &str, base: [f32; 2], room: u32, size: f32, ink: Rgb<u8>) {
+fn draw_text(
+    page: &mut RgbImage,
+    words: &str,
+    base: [f32; 2],
+    max_width: u32,
+    size: f32,
+    ink: Rgb<u8>,
+) {
     let font = FontRef::try_from_slice(epaint_default_fonts::UBUNTU_LIGHT)
         .expect("the font is part of the program");
     let font = font.as_scaled(PxScale::from(size));
-    let end = base[0] + room as f32;
+    let end = base[0] + max_width as f32;
     let mut pen = base[0];
     for letter in words.chars() {
         let glyph = font.scaled_glyph(letter);
@@ -161,7 +170,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pictures_stand_in_rows_over_their_words() {
+    fn tiles_are_arranged_in_rows_with_text_below() {
         let note = "0.98, 120 pixels, and more than there is room for on one line of a sheet";
         let tile = |color: [u8; 3], title: &str| {
             Tile::new(&RgbImage::from_pixel(64, 32, Rgb(color)), title, note)

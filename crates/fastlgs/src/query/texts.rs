@@ -197,14 +197,15 @@ impl Texts {
             .examples(name)?
             .iter()
             .filter(|e| e.encoder == self.identity);
-        let meant: Vec<Vec<f32>> = own.flat_map(|e| e.embeddings.iter().cloned()).collect();
-        (!meant.is_empty()).then(|| TextQuery::of_examples(meant, self.calibrations.pictures))
+        let embeddings: Vec<Vec<f32>> = own.flat_map(|e| e.embeddings.iter().cloned()).collect();
+        (!embeddings.is_empty())
+            .then(|| TextQuery::of_examples(embeddings, self.calibrations.pictures))
     }
 
     /// Returns the query of a text from its embedding.
     fn embedded_query(&self, text: &str, embedding: Vec<f32>) -> TextQuery {
         let calibration = self.calibrations.texts;
-        let anything = calibration.anything + self.encoder.advantage(text);
+        let anything = calibration.anything + self.encoder.baseline_shift(text);
         TextQuery {
             canonical: self.canonical.clone(),
             min_canonical: anything,

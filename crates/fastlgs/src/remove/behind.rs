@@ -4,7 +4,7 @@ use crate::{Result, Scene};
 use fastlgs_core::{Camera, LabelMap};
 use glam::Vec3;
 
-/// Least number of views that must show a Gaussian outside of the hidden pixels.
+/// Least number of views that show a remaining Gaussian outside of the hidden pixels.
 const MIN_VIEWS: u8 = 2;
 /// Least sum of blending weights of a Gaussian in such a view, in pixels.
 const MIN_WEIGHT: f32 = 0.5;
@@ -12,9 +12,9 @@ const MIN_WEIGHT: f32 = 0.5;
 /// Returns for each Gaussian whether it remains. `views` holds the hidden pixels of each view:
 /// those that the object may have coloured.
 ///
-/// A Gaussian remains if two views show it outside of the hidden pixels. It also remains if no view
-/// shows it, or its centre, within them. All others belong to the object or lie inside or below it,
-/// where photos do not constrain training.
+/// A Gaussian remains if at least two views show it outside of the hidden pixels. It also remains
+/// if neither it nor its centre is within the hidden pixels of any view. All others belong to the
+/// object, or lie inside or below it, where photos do not constrain training.
 pub fn remaining_gaussians(scene: &mut Scene, views: &[(Camera, Vec<bool>)]) -> Result<Vec<bool>> {
     let mut view_counts = vec![0u8; scene.gaussians().len()];
     let mut within = vec![false; scene.gaussians().len()];

@@ -61,7 +61,7 @@ pub fn write(
             continue;
         }
         let mut photo = folder.photo(&camera.name)?;
-        let counts = counted_pixels(folder, &camera.name, hidden.len())?;
+        let counts = pixels_that_count(folder, &camera.name, hidden.len())?;
         patch(&mut photo, hidden, &counts, session.render(camera)?.color());
         image_io::save_png(&folder.photo_path(&camera.name), photo)?;
         if folder.masks_path(&camera.name).is_file() {
@@ -70,7 +70,7 @@ pub fn write(
             masks.masks.retain(|mask| {
                 let own = mask
                     .runs
-                    .places(width, height)
+                    .pixel_indices(width, height)
                     .filter(|p| hidden[*p])
                     .count();
                 (own as f64) < MIN_HIDDEN_SHARE * mask.runs.area() as f64
@@ -105,7 +105,7 @@ pub fn write(
 }
 
 /// Returns the pixels of a photo that count: opaque ones that no mask ignores.
-fn counted_pixels(folder: &SceneFolder, name: &str, pixels: usize) -> Result<Vec<bool>> {
+fn pixels_that_count(folder: &SceneFolder, name: &str, pixels: usize) -> Result<Vec<bool>> {
     let mut counts = vec![true; pixels];
     for path in [folder.alpha_path(name), folder.ignore_path(name)]
         .into_iter()
@@ -170,7 +170,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_patch_is_as_bright_as_its_photo() {
+    fn patched_colours_match_the_brightness_of_the_photo() {
         // The visible half of the photo is half as bright as the render; the right half is hidden.
         let mut photo = RgbImage::from_fn(8, 2, |x, _| Rgb([if x < 4 { 50 } else { 255 }; 3]));
         let hidden: Vec<bool> = (0..16).map(|p| p % 8 >= 4).collect();

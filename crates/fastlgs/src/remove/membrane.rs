@@ -55,24 +55,24 @@ fn fill_by_rings<T: Copy>(
     width: usize,
     value: impl Fn(&[T]) -> T,
 ) {
-    let mut open = hole.to_vec();
+    let mut unknown = hole.to_vec();
     let mut rest: Vec<usize> = (0..hole.len()).filter(|p| hole[*p]).collect();
     while !rest.is_empty() {
-        let beside = |p: &usize| {
+        let from_neighbours = |p: &usize| {
             let known: Vec<T> = neighbours(*p, width, hole.len())
                 .into_iter()
-                .filter(|q| !open[*q])
+                .filter(|q| !unknown[*q])
                 .map(|q| values[q])
                 .collect();
             (!known.is_empty()).then(|| (*p, value(&known)))
         };
-        let ring: Vec<(usize, T)> = rest.iter().filter_map(beside).collect();
+        let ring: Vec<(usize, T)> = rest.iter().filter_map(from_neighbours).collect();
         if ring.is_empty() {
             break;
         }
         ring.into_iter()
-            .for_each(|(p, value)| (values[p], open[p]) = (value, false));
-        rest.retain(|p| open[*p]);
+            .for_each(|(p, value)| (values[p], unknown[p]) = (value, false));
+        rest.retain(|p| unknown[*p]);
     }
 }
 

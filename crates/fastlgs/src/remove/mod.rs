@@ -80,7 +80,8 @@ pub struct RemoveReport {
     pub removed: usize,
     /// Number of Gaussians that were added in gaps.
     pub filled: usize,
-    /// Share of the hidden pixels of all training photos behind which other photos show a surface.
+    /// Share of the hidden pixels of all training photos at which other photos show the surface
+    /// behind the object.
     pub seen: f64,
     /// Number of remaining objects.
     pub left: usize,
@@ -93,7 +94,7 @@ const FILL_OPACITY: f32 = 0.95;
 /// Radius of these Gaussians in pixel spacings at their depth: wide enough to close the space
 /// between neighbours.
 const FILL_RADIUS: f32 = 0.7;
-/// Share of the pixels of a view up to which a gap is not filled.
+/// A gap with at most this share of the pixels of a view is not filled.
 const MIN_GAP_SHARE: f64 = 1e-5;
 /// Transmittance above which a pixel is empty.
 const EMPTY_TRANSMITTANCE: f32 = 0.5;
@@ -129,7 +130,7 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
 
     let mut gaps = Vec::new();
     for (camera, hidden) in &hidden.in_training {
-        gaps.push(gap(&mut scene, camera, hidden)?);
+        gaps.push(empty_hidden_pixels(&mut scene, camera, hidden)?);
     }
     let gap_pixels: usize = gaps.iter().map(|gap| count_set(gap)).sum();
     let hidden_pixels: usize = hidden.in_training.iter().map(|h| count_set(&h.1)).sum();
@@ -239,7 +240,7 @@ fn remaining(
 ) -> Result<Vec<usize>> {
     let mut remains = behind::remaining_gaussians(scene, &hidden.in_training)?;
     for (i, remains) in remains.iter_mut().enumerate() {
-        *remains |= transparent::is_clear(scene.gaussians(), i);
+        *remains |= transparent::is_transparent(scene.gaussians(), i);
     }
     for i in selection::gaussians(scene.gaussians(), grid, objects) {
         remains[i] = false;
@@ -307,7 +308,7 @@ fn solid_colors(scene: &mut Scene, camera: &Camera) -> Result<Vec<f32>> {
 }
 
 /// Returns the hidden pixels of a view that are empty.
-fn gap(scene: &mut Scene, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool>> {
+fn empty_hidden_pixels(scene: &mut Scene, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool>> {
     let frame = scene.render(camera)?;
     Ok(hidden
         .iter()
@@ -332,7 +333,7 @@ fn fill(
     for (camera, hidden) in order.into_iter().map(|k| &views[k]) {
         work.advance()?;
         // Other views may have filled a part of this gap.
-        let gap = gap(scene, camera, hidden)?;
+        let gap = empty_hidden_pixels(scene, camera, hidden)?;
         let (n, width) = (gap.len(), camera.width as usize);
         if count_set(&gap) as f64 <= MIN_GAP_SHARE * n as f64 || count_set(&gap) == n {
             continue;

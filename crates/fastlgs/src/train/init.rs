@@ -19,7 +19,8 @@ use std::sync::Arc;
 const MIN_INITIAL_GAUSSIANS: usize = 5000;
 
 /// Returns the initial Gaussians: those of `config.init`, else one for each point of the scene. A
-/// backdrop is added if views are few, and random points if there are fewer than `MIN_INITIAL_GAUSSIANS`.
+/// backdrop is added if there are fewer than [`FEW_VIEWS`] views, and random points if there are
+/// fewer than [`MIN_INITIAL_GAUSSIANS`].
 pub fn gaussians(
     config: &TrainConfig,
     folder: &SceneFolder,
@@ -28,14 +29,14 @@ pub fn gaussians(
 ) -> Result<Gaussians> {
     if let Some(path) = &config.init {
         // The scene's own file is already in the scene's frame.
-        let frame = if is_own(folder, path) {
+        let frame = if is_scene_ply(folder, path) {
             WorldFrame::default()
         } else {
             folder.manifest()?.frame
         };
         let (first, warning) = splat_file::read(path, &frame)?;
         warning.into_iter().for_each(|warning| run.warn(&warning));
-        return if is_own(folder, path) {
+        return if is_scene_ply(folder, path) {
             Ok(first)
         } else {
             with_matching_axes(first, path, views, config, run)
@@ -50,12 +51,12 @@ pub fn gaussians(
         .cameras
         .iter()
         .any(|camera| folder.alpha_path(&camera.name).is_file());
-    let behind = if views.len() < FEW_VIEWS && !cut_out {
+    let backdrop = if views.len() < FEW_VIEWS && !cut_out {
         init::backdrop(views, &points, most / 2)?
     } else {
         Gaussians::default()
     };
-    let missing = MIN_INITIAL_GAUSSIANS.saturating_sub(points.len() + behind.len());
+    let missing = MIN_INITIAL_GAUSSIANS.saturating_sub(points.len() + backdrop.len());
     if missing > 0 {
         run.warn(&format!(
             "the scene has only {} points; training starts from {missing} random ones in addition",
@@ -64,9 +65,9 @@ pub fn gaussians(
         points.extend(init::random_points(views, missing, &mut rng)?);
     }
     rng.shuffle(&mut points);
-    points.truncate(most - behind.len());
+    points.truncate(most - backdrop.len());
     let mut first = init::from_points(&points);
-    first.append(behind);
+    first.append(backdrop);
     Ok(first)
 }
 
@@ -112,28 +113,31 @@ fn with_matching_axes(
         }
         Ok(sum)
     };
-    let turned = first.clone().with_y_and_z_flipped();
-    if error(&turned)? * MIN_ERROR_RATIO < error(&first)? {
+    let flipped = first.clone().with_y_and_z_flipped();
+    if error(&flipped)? * MIN_ERROR_RATIO < error(&first)? {
         run.warn(&format!("{}: y and z have the opposite sign of those of the photos' poses; the Gaussians were flipped", path.display()));
-        return Ok(turned);
+        return Ok(flipped);
     }
     Ok(first)
 }
 
 /// Returns whether `path` is the `scene.ply` of this scene.
-fn is_own(folder: &SceneFolder, path: &Path) -> bool {
+fn is_scene_ply(folder: &SceneFolder, path: &Path) -> bool {
     let place = |path: &Path| path.canonicalize().ok();
     place(path).is_some_and(|path| Some(path) == place(&folder.ply_path()))
 }
 
-/// Returns the options. If training starts from the scene's own Gaussians, their background and
-/// filter are the defaults.
+/// Returns the options with background and filter set. If training starts from the scene's own
+/// Gaussians, those of their training are the defaults.
 pub fn with_earlier_settings(
     config: &TrainConfig,
     folder: &SceneFolder,
     manifest: &Manifest,
 ) -> Result<TrainConfig> {
-    let own = config.init.as_ref().filter(|path| is_own(folder, path));
+    let own = config
+        .init
+        .as_ref()
+        .filter(|path| is_scene_ply(folder, path));
     let earlier = if own.is_some() {
         SceneNotes::read(manifest, &folder.root)?
             .train
@@ -152,8 +156,8 @@ pub fn with_earlier_settings(
     })
 }
 
-/// Returns the space that the views show to be empty, in which density control removes floaters. It
-/// is empty with `FEW_VIEWS` or more views, or without iterations.
+/// Returns the space that the views show to be empty, in which density control removes floaters.
+/// With [`FEW_VIEWS`] or more views, or without iterations, nothing is known to be empty.
 pub fn free_space(
     config: &TrainConfig,
     folder: &SceneFolder,
@@ -206,8 +210,8 @@ pub fn targets(
     })
 }
 
-/// Loads the target image of a view: the photo and, with `codes`, the code map. Ignored pixels do
-/// not count; transparent pixels show the background.
+/// Loads the target image of a view: the photo and, with `codes`, the code map. Ignored pixels are
+/// packed as pixels that do not count. Transparent pixels show the background.
 ///
 /// # Errors
 /// A file that cannot be read, a photo whose size differs from its camera, or a transparent photo

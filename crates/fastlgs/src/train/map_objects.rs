@@ -42,7 +42,7 @@ pub fn map_objects(inputs: &Inputs, trained: &mut Trained, run: &Run) -> Result<
         Some(grid) => {
             scene.append(std::mem::take(kept_transparent).with_sh_degree(scene.sh_degree));
             mapper.lift(scene, &grid)?;
-            transparent::keep_owned(scene);
+            transparent::remove_unowned(scene);
             (grid, None)
         }
         None => {

@@ -48,7 +48,7 @@ pub fn begin(
             engine,
             run: &run,
         };
-        find(&mut mapper, scene)
+        write_targets(&mut mapper, scene)
     })?;
     resume_targets(trainer, folder)
 }
@@ -76,7 +76,7 @@ pub fn resume_targets(trainer: &mut Trainer, folder: &SceneFolder) -> Result<()>
             .map(|camera| camera.name)
             .collect::<Vec<_>>(),
     );
-    let read = move |id: usize| of_view(&folder, &names[id], &codes);
+    let read = move |id: usize| packed_codes(&folder, &names[id], &codes);
     trainer.set_codes(move |id| {
         read(id).map_err(|error| fastlgs_raster::Error::Picture(Box::new(error)))
     });
@@ -84,8 +84,8 @@ pub fn resume_targets(trainer: &mut Trainer, folder: &SceneFolder) -> Result<()>
 }
 
 /// Returns the packed code of each pixel of a view. Pixels without an object, and ignored pixels,
-/// do not count.
-fn of_view(folder: &SceneFolder, name: &str, codes: &[[u8; 3]]) -> Result<Vec<u32>> {
+/// are packed as pixels that do not count.
+fn packed_codes(folder: &SceneFolder, name: &str, codes: &[[u8; 3]]) -> Result<Vec<u32>> {
     let map = LabelMap::load(&target_path(folder, &format!("{name}.png")))?;
     let ignored = Some(folder.ignore_path(name))
         .filter(|path| path.is_file())
@@ -103,16 +103,16 @@ fn of_view(folder: &SceneFolder, name: &str, codes: &[[u8; 3]]) -> Result<Vec<u3
 
 /// Finds the objects, writes the mask targets of all views, and sets the feature of every Gaussian
 /// to the code of its object.
-fn find(mapper: &mut objects::Mapper, scene: &mut Gaussians) -> Result<()> {
+fn write_targets(mapper: &mut objects::Mapper, scene: &mut Gaussians) -> Result<()> {
     let folder = mapper.folder;
     let lists = mapper.map(scene)?.chosen.lists();
-    let mut beside = Adjacency::default();
+    let mut adjacency = Adjacency::default();
     mapper.render_maps(scene, &lists, |camera, shown| {
         let map = objects_of_atoms(&shown, &objects::atoms(folder, camera)?.map);
-        beside.add(&map);
+        adjacency.add(&map);
         Ok(map.save(&target_path(folder, &format!("{}.png", camera.name)))?)
     })?;
-    let codes = beside.codes(lists.len());
+    let codes = adjacency.codes(lists.len());
     fs::write_json(&target_path(folder, "codes.json"), &codes)
         .context("the object codes cannot be written")?;
     scene.features = scene
@@ -211,16 +211,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn masks_end_where_they_end_whatever_is_shown() {
+    fn an_atom_gets_the_object_of_most_of_its_pixels() {
         let map = |labels: &[u16]| LabelMap {
             labels: labels.to_vec(),
             ..LabelMap::new(4, 2)
         };
         // Atom 1 is mostly object 5, atom 2 half 5 and half 6, atom 3 shows no object.
         let atoms = map(&[1, 1, 1, 2, 2, 3, 3, 0]);
-        let shown = map(&[5, 5, 6, 5, 6, 0, 0, 6]);
+        let object_map = map(&[5, 5, 6, 5, 6, 0, 0, 6]);
         assert_eq!(
-            objects_of_atoms(&shown, &atoms).labels,
+            objects_of_atoms(&object_map, &atoms).labels,
             [5, 5, 5, 0, 0, 0, 0, 0]
         );
     }

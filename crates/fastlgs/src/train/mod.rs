@@ -77,7 +77,7 @@ fn check(config: &TrainConfig) -> Result<()> {
     Ok(())
 }
 
-/// What a training reads from the scene folder.
+/// Options of a training, and its inputs from the scene folder.
 struct Inputs {
     config: TrainConfig,
     folder: SceneFolder,
@@ -217,6 +217,6 @@ fn write(inputs: Inputs, trained: Trained, mapped: MappedObjects) -> Result<Trai
     staged.publish(&folder, &REPLACED, [], &manifest)?;
     objects::mark_maps_finished(&folder);
     // Only an interrupted run needs its checkpoints.
-    checkpoints::forget(&folder);
+    checkpoints::remove_all(&folder);
     Ok(report)
 }

@@ -8,7 +8,7 @@ use fastlgs_core::{Camera, Gaussians};
 use fastlgs_raster::{Choice, Engine, Progress, Targets, Trainer, TrainerConfig, TrainerReport};
 use std::time::Instant;
 
-/// Trained Gaussians, and what the report needs of their training.
+/// Trained Gaussians, and the data of their training that the report needs.
 pub struct Trained {
     pub scene: Gaussians,
     /// The device.
@@ -38,9 +38,9 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
     held_out.check()?;
     let device = fastlgs_raster::choice(run.device);
     let mut engine = fastlgs_raster::open_engine(&device.device)?;
-    let first = first_gaussians(inputs, &targets, &mut *engine, run)?;
+    let first = initial_gaussians(inputs, &targets, &mut *engine, run)?;
     let kept_transparent = match config.mapping {
-        Mapping::Keep => transparent::take(&mut folder.gaussians()?),
+        Mapping::Keep => transparent::take_transparent(&mut folder.gaussians()?),
         Mapping::Paper | Mapping::Global => Gaussians::default(),
     };
     let brightness = inputs.notes.brightness.clone().unwrap_or_default();
@@ -58,7 +58,7 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
     trainer.set_free_space(free);
     resume(&mut trainer, inputs, run)?;
     run.progress.on_message(Message::TrainingBegins(&first));
-    let mut watch = Watch {
+    let mut watch = ProgressWatcher {
         inputs,
         held_out: &held_out,
         settings: &settings,
@@ -71,7 +71,7 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
         watch.on_progress(progress, trainer)
     })?;
     drop(work);
-    let Watch {
+    let ProgressWatcher {
         curve,
         supervision_seconds,
         ..
@@ -106,7 +106,7 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
 }
 
 /// Returns the Gaussians that training starts from, with their features.
-fn first_gaussians(
+fn initial_gaussians(
     inputs: &Inputs,
     targets: &Targets,
     engine: &mut dyn Engine,
@@ -115,15 +115,15 @@ fn first_gaussians(
     let config = &inputs.config;
     let mut first = init::gaussians(config, &inputs.folder, targets, run)?;
     // Gaussians of transparent objects have no colour to train.
-    transparent::take(&mut first);
+    transparent::take_transparent(&mut first);
     let has_features = config.init.is_some() && config.mapping == Mapping::Keep;
     if let Some(objects) = inputs
         .prior_objects
         .as_ref()
         .filter(|_| inputs.trains_features() && !has_features)
     {
-        // Start from the objects on which most views agree. From elsewhere, descent ends between
-        // the codes of views that disagree.
+        // Features start from the objects on which most views agree. From other features, descent
+        // ends between the codes of views that disagree.
         let mut mapper = objects::Mapper {
             folder: &inputs.folder,
             cameras: &inputs.training,
@@ -136,7 +136,7 @@ fn first_gaussians(
     Ok(first)
 }
 
-/// Continues from the last checkpoint, if that is asked for.
+/// Continues from the last checkpoint if `resume` is set.
 fn resume(trainer: &mut Trainer, inputs: &Inputs, run: &Run) -> Result<()> {
     let checkpoint = checkpoints::path(&inputs.folder);
     if inputs.config.resume && !trainer.resume(&checkpoint)? {
@@ -152,7 +152,7 @@ fn resume(trainer: &mut Trainer, inputs: &Inputs, run: &Run) -> Result<()> {
 }
 
 /// Follows a training: starts mask supervision, measures the curve, and reports progress.
-struct Watch<'a> {
+struct ProgressWatcher<'a> {
     inputs: &'a Inputs,
     held_out: &'a Targets,
     settings: &'a TrainerConfig,
@@ -161,7 +161,7 @@ struct Watch<'a> {
     supervision_seconds: f64,
 }
 
-impl Watch<'_> {
+impl ProgressWatcher<'_> {
     fn on_progress(&mut self, progress: &Progress, trainer: &mut Trainer) -> Result<()> {
         let Progress {
             iteration,

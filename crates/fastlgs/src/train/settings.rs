@@ -8,9 +8,9 @@ use fastlgs_core::scene_folder::Manifest;
 use fastlgs_raster::{Alignment, Channels, Targets, TrainerConfig};
 
 /// Typical brightness difference of two photos, in stops, from which `auto` learns exposures.
-const VARYING: f32 = 0.15;
+const MIN_BRIGHTNESS_SPREAD: f32 = 0.15;
 
-/// Returns the trainer's configuration. The preset decides what no option sets.
+/// Returns the trainer's configuration. The preset supplies the values of options that are not set.
 pub fn settings(
     config: &TrainConfig,
     first: &Gaussians,
@@ -19,13 +19,13 @@ pub fn settings(
     brightness: &Brightness,
     seed: u64,
 ) -> TrainerConfig {
-    let by_descent = config.feature_mode == FeatureMode::Train;
+    let trains_features = config.feature_mode == FeatureMode::Train;
     let background = config.background.unwrap_or_default();
     TrainerConfig {
         iterations: config.iterations(),
         seed,
         budget: config.budget(views.pixels()),
-        channels: match (config.freeze, by_descent) {
+        channels: match (config.freeze, trains_features) {
             (true, _) => Channels::Feature,
             (false, false) => Channels::Color,
             // As in the paper: features move Gaussians, too.
@@ -45,7 +45,7 @@ pub fn settings(
         background: background.color,
         learn_background: background.learn,
         exposure: match config.exposure {
-            Exposures::Auto => brightness.spread_stops >= VARYING,
+            Exposures::Auto => brightness.spread_stops >= MIN_BRIGHTNESS_SPREAD,
             Exposures::On => true,
             Exposures::Off => false,
         },

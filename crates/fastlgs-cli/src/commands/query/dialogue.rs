@@ -41,7 +41,7 @@ const HELP: &str = "enter a text to find it; view NAME: change the view; views: 
 
 impl QueryRunner<'_> {
     /// Runs the dialogue until `quit` or the end of input.
-    pub(super) fn converse(&mut self) -> Result<Outcome> {
+    pub(super) fn run_dialogue(&mut self) -> Result<Outcome> {
         print_line!("{HELP}");
         let mut last = None;
         loop {
@@ -58,7 +58,7 @@ impl QueryRunner<'_> {
                 print_line!("the line is not UTF-8 text; send it in UTF-8");
                 continue;
             };
-            let said = match Command::of(&line) {
+            let reply = match Command::of(&line) {
                 Command::Quit => return Ok(Outcome::Done),
                 Command::Nothing => continue,
                 Command::Help => Ok(HELP.to_owned()),
@@ -77,7 +77,7 @@ impl QueryRunner<'_> {
                         .map(|report| answer_text(&report))
                 }
             };
-            match said {
+            match reply {
                 Ok(words) if words.is_empty() => {}
                 Ok(words) => print_line!("{words}"),
                 Err(error) => print_line!("{error:#}"),
@@ -93,7 +93,7 @@ impl QueryRunner<'_> {
                 .size
                 .map_or(camera.clone(), |(w, h)| camera.resized(w, h)),
         ];
-        self.shown = None;
+        self.rendered_view = None;
         Ok(())
     }
 
@@ -106,7 +106,7 @@ impl QueryRunner<'_> {
             .output
             .get_or_insert_with(|| PathBuf::from("answers"))
             .clone();
-        self.shown = None;
+        self.rendered_view = None;
         let saved = self
             .answer(&ObjectQuery::Text(text.to_owned()), 0)
             .and_then(|report| Ok((report, self.sheet()?.unwrap_or(named))));
