@@ -449,7 +449,7 @@ fn labels_of_every_layout_agree() {
     std::fs::copy(at("cat/008.png"), wrong.join("009.png")).expect("a mask");
     assert_fails(
         &["eval", text(&f.scene), "--labels", text(&wrong)],
-        &["009.png", "trained on", "--holdout-labels"],
+        &["009.png", "trained on", "holdout_labels"],
     );
     std::fs::rename(wrong.join("009.png"), wrong.join("none.png")).expect("a mask");
     assert_fails(

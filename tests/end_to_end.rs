@@ -94,7 +94,7 @@ fn the_papers_mapping_and_trained_features_work_too() {
     );
     assert_fails(
         &["train", text(&scene), "--feature-mode", "train"],
-        &["--mapping paper"],
+        &["--feature-mode", "mapping to paper"],
     );
 
     // With --freeze, only features are trained. Geometry and colour of the Gaussians stay.
@@ -431,7 +431,7 @@ fn onnx_exports_of_sam_and_clip() {
     .expect("a file");
     assert_fails(
         &["query", text(&scene), "red"],
-        &["another encoder", "--iterations 0"],
+        &["another encoder", "iterations to 0"],
     );
     std::fs::write(scene.join("scene.json"), manifest).expect("a file");
     // A scene knows the hashes of its models and rejects other files.
@@ -655,7 +655,7 @@ fn bad_input_is_reported_and_scenes_stay_unchanged() {
     .expect("a file");
     assert_fails(
         &["query", text(&copy), "cat"],
-        &["another encoder", "--iterations 0"],
+        &["another encoder", "iterations to 0"],
     );
     json(&[
         "train",

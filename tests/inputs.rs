@@ -449,7 +449,7 @@ fn a_scene_file_without_object_ids_is_reported() {
         .expect("the column");
     std::fs::write(&path, [&data[..at], b"something", &data[at + 9..]].concat())
         .expect("the scene");
-    let remedy = ["object_id", "--iterations 0"];
+    let remedy = ["object_id", "iterations to 0"];
     assert_fails(&["query", text(&scene), "coffee"], &remedy);
     assert_fails(
         &[

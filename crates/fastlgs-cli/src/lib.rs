@@ -149,9 +149,21 @@ pub fn exit_code(result: anyhow::Result<Outcome>) -> ExitCode {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
         Ok(Outcome::NotFound) => ExitCode::from(3),
         Err(error) => {
-            eprintln!("error: {}", fastlgs::one_sentence(error.as_ref()));
+            eprintln!("error: {}", sentence(&error));
             ExitCode::from(1)
         }
+    }
+}
+
+/// Returns an error as one sentence. Fields of configurations get the names of their flags.
+fn sentence(error: &anyhow::Error) -> String {
+    let option = error.chain().find_map(|cause| match cause.downcast_ref() {
+        Some(fastlgs::Error::Option { option, reason }) => Some((option, reason)),
+        _ => None,
+    });
+    match option {
+        Some((option, reason)) => format!("--{}: {reason}", option.replace('_', "-")),
+        None => fastlgs::one_sentence(error.as_ref()),
     }
 }
 

@@ -1,9 +1,11 @@
-//! `docs/reference/commands.md`, generated from the command line.
+//! `docs/reference/commands.md` and the option types of the Python package, generated from the command
+//! line.
 
 use crate::{config_file, program};
 use clap::{Arg, ArgAction, Command};
+use std::any::TypeId;
 use std::fmt::Write as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Global options that the help shows.
 const GLOBAL: [&str; 5] = ["verbose", "quiet", "json", "device", "config"];
@@ -140,15 +142,156 @@ fn usage(option: &Arg) -> String {
     }
 }
 
-#[test]
-fn the_reference_page_is_current() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/reference/commands.md");
-    if std::env::var_os("FASTLGS_UPDATE_DOCS").is_some() {
-        std::fs::write(&path, reference()).expect("a writable page");
-    }
-    let page = std::fs::read_to_string(&path).expect("the page");
-    assert!(
-        page == reference(),
-        "run FASTLGS_UPDATE_DOCS=1 cargo test -p fastlgs-cli reference, and look at the page"
+/// Returns `fastlgs/options.py`: a `TypedDict` of the options of each stage. A key is a field of the
+/// stage's configuration; its type and help are those of the command line.
+fn python_options() -> String {
+    let mut out = String::from(
+        "\"\"\"Options of the stages, generated from the command line: keyword arguments of the functions.\"\"\"\n\n\
+         from os import PathLike\n\
+         from typing import List, Literal, Optional, Tuple, TypedDict, Union\n\n\
+         Path = Union[str, \"PathLike[str]\"]\n",
     );
+    let stages = [
+        (
+            "Preprocess",
+            "preprocess",
+            fields(&fastlgs::PreprocessConfig::default()),
+        ),
+        ("Train", "train", fields(&fastlgs::TrainConfig::default())),
+        ("Synth", "synth", fields(&fastlgs::SynthConfig::default())),
+        (
+            "Remove",
+            "remove",
+            fields(&fastlgs::RemoveConfig::default()),
+        ),
+        ("Evaluate", "eval", fields(&fastlgs::EvalConfig::default())),
+    ];
+    let mut program = program::command();
+    program.build();
+    for (class, name, mut fields) in stages {
+        let command = program.find_subcommand(name).expect("a command");
+        // These are arguments of the Python functions.
+        for argument in [
+            "photos", "scene", "output", "kind", "text", "object", "labels",
+        ] {
+            fields.retain(|field| field != argument);
+        }
+        let _ = write!(
+            out,
+            "\n\nclass {class}Options(TypedDict, total=False):\n    \"\"\"Options of `fastlgs {name}`.\"\"\"\n"
+        );
+        for field in fields {
+            let option = command
+                .get_arguments()
+                .find(|arg| {
+                    arg.get_long()
+                        .is_some_and(|long| long.replace('-', "_") == field)
+                })
+                .unwrap_or_else(|| panic!("fastlgs {name} has no option for the field {field}"));
+            let help = option
+                .get_help()
+                .map(ToString::to_string)
+                .unwrap_or_default();
+            for line in wrapped(&help, 90) {
+                let _ = write!(out, "\n    # {line}");
+            }
+            let _ = writeln!(out, "\n    {field}: {}", python_type(option));
+        }
+    }
+    out
+}
+
+/// Returns the fields of a configuration, in the order of their names.
+fn fields(config: &impl serde::Serialize) -> Vec<String> {
+    let value = serde_json::to_value(config).expect("a configuration is JSON");
+    value
+        .as_object()
+        .expect("a struct")
+        .keys()
+        .cloned()
+        .collect()
+}
+
+/// Returns the Python type of an option's value.
+fn python_type(option: &Arg) -> String {
+    if !matches!(option.get_action(), ArgAction::Set | ArgAction::Append) {
+        return "bool".to_owned();
+    }
+    let values = option.get_possible_values();
+    if !values.is_empty() {
+        let names: Vec<String> = values
+            .iter()
+            .map(|v| format!("\"{}\"", v.get_name()))
+            .collect();
+        return match names.as_slice() {
+            [a, b] if a == "\"true\"" && b == "\"false\"" => "bool".to_owned(),
+            names => format!("Literal[{}]", names.join(", ")),
+        };
+    }
+    let kind = option.get_value_parser().type_id();
+    let is = |kinds: &[TypeId]| kinds.iter().any(|known| kind == *known);
+    let integers = [
+        TypeId::of::<u16>(),
+        TypeId::of::<u32>(),
+        TypeId::of::<u64>(),
+        TypeId::of::<usize>(),
+    ];
+    let one = if is(&integers) {
+        "int"
+    } else if is(&[TypeId::of::<f32>(), TypeId::of::<f64>()]) {
+        "float"
+    } else if is(&[TypeId::of::<PathBuf>()]) {
+        "Path"
+    } else if is(&[TypeId::of::<String>()]) {
+        "str"
+    } else if is(&[TypeId::of::<(u32, u32)>()]) {
+        "Tuple[int, int]"
+    } else {
+        panic!("{}: add the Python type of this option", option.get_id())
+    };
+    match option.get_action() {
+        ArgAction::Append => format!("List[{one}]"),
+        _ => one.to_owned(),
+    }
+}
+
+/// Breaks a text into lines of at most `width` characters.
+fn wrapped(text: &str, width: usize) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        match lines
+            .last_mut()
+            .filter(|line| line.len() + 1 + word.len() <= width)
+        {
+            Some(line) => {
+                line.push(' ');
+                line.push_str(word);
+            }
+            None => lines.push(word.to_owned()),
+        }
+    }
+    lines
+}
+
+#[test]
+fn generated_files_are_current() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let files = [
+        ("docs/reference/commands.md", reference()),
+        (
+            "crates/fastlgs-py/python/fastlgs/options.py",
+            python_options(),
+        ),
+    ];
+    for (file, text) in files {
+        let path = root.join(file);
+        if std::env::var_os("FASTLGS_UPDATE_DOCS").is_some() {
+            std::fs::write(&path, &text).expect("a writable file");
+        }
+        let current = std::fs::read_to_string(&path).expect("the file");
+        assert!(
+            current == text,
+            "{file}: run FASTLGS_UPDATE_DOCS=1 cargo test -p fastlgs-cli reference, and look at the file"
+        );
+    }
 }

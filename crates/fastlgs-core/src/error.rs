@@ -21,7 +21,10 @@ pub enum Error {
         /// What is wrong and how to fix it.
         reason: String,
     },
-    /// A request that does not match the data, such as an unknown view or an empty folder.
+    /// A view that does not exist.
+    #[error("{0}")]
+    NotFound(String),
+    /// A request that does not match the data, such as an empty folder.
     #[error("{0}")]
     Invalid(String),
 }

@@ -119,8 +119,7 @@ impl SceneFolder {
         let folder = Self::new(root);
         if !folder.manifest_path().is_file() {
             return Err(Error::Invalid(format!(
-                "{}: not a scene (no scene.json); run 'fastlgs preprocess PHOTOS -o {}' first",
-                root.display(),
+                "{}: not a scene (no scene.json); run 'fastlgs preprocess' first",
                 root.display()
             )));
         }
@@ -248,7 +247,7 @@ impl SceneFolder {
         find_view(cameras.iter().map(|c| c.name.as_str()), name).ok_or_else(|| {
             let names: Vec<&str> = cameras.iter().take(6).map(|c| c.name.as_str()).collect();
             let (root, n, names) = (self.root.display(), cameras.len(), names.join(", "));
-            Error::Invalid(format!(
+            Error::NotFound(format!(
                 "no view '{name}' in {root}; it has {n} views: {names}, ..."
             ))
         })

@@ -1,5 +1,6 @@
 //! The Python class `Answer`.
 
+use crate::object::FoundObject;
 use crate::options::to_python;
 use fastlgs::query::answer::AnswerReport;
 use numpy::PyArray2;
@@ -60,10 +61,10 @@ impl Answer {
         self.relevancy.clone_ref(py)
     }
 
-    /// Objects of the answer: id, parent, support, score, bbox2d, bbox3d, pixels, gaussians.
+    /// Objects of the answer.
     #[getter]
-    fn objects<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        to_python(py, &self.report.objects)
+    fn objects(&self) -> Vec<FoundObject> {
+        self.report.objects.iter().map(FoundObject::from).collect()
     }
 
     /// The report of the answer, as `fastlgs query --json` prints it.

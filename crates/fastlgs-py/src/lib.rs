@@ -6,6 +6,7 @@
 mod answer;
 mod camera;
 mod fork;
+mod object;
 mod options;
 mod scene;
 mod stage;
@@ -23,9 +24,34 @@ create_exception!(
     "An error of the pipeline: one sentence that names the file and the solution."
 );
 
+create_exception!(
+    fastlgs,
+    NotFound,
+    Error,
+    "A view, object or name that does not exist."
+);
+create_exception!(
+    fastlgs,
+    Cancelled,
+    Error,
+    "The progress callback cancelled the stage."
+);
+
 /// Converts an error of the pipeline to a Python exception.
 fn to_py_error(error: impl Into<fastlgs::Error>) -> PyErr {
-    Error::new_err(fastlgs::one_sentence(&error.into()))
+    let error = error.into();
+    let sentence = fastlgs::one_sentence(&error);
+    let mut cause = &error;
+    while let fastlgs::Error::While { source, .. } = cause {
+        cause = source;
+    }
+    match cause {
+        fastlgs::Error::NotFound(_) | fastlgs::Error::Core(fastlgs_core::Error::NotFound(_)) => {
+            NotFound::new_err(sentence)
+        }
+        fastlgs::Error::Cancelled => Cancelled::new_err(sentence),
+        _ => Error::new_err(sentence),
+    }
 }
 
 /// Makes a queryable scene from photos. Keeps an existing scene if photos and options have not
@@ -133,8 +159,12 @@ fn synth<'py>(
 fn _fastlgs(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add("Error", module.py().get_type::<Error>())?;
+    module.add("NotFound", module.py().get_type::<NotFound>())?;
+    module.add("Cancelled", module.py().get_type::<Cancelled>())?;
     module.add_class::<scene::Scene>()?;
     module.add_class::<answer::Answer>()?;
+    module.add_class::<object::Object>()?;
+    module.add_class::<object::FoundObject>()?;
     module.add_class::<camera::Camera>()?;
     module.add_function(wrap_pyfunction!(make, module)?)?;
     module.add_function(wrap_pyfunction!(preprocess, module)?)?;

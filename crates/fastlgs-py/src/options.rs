@@ -46,12 +46,6 @@ pub fn with_options<T: Serialize + DeserializeOwned>(
     let given: serde_json::Map<String, Value> =
         serde_json::from_str(&plain.extract::<String>()?).map_err(to_error)?;
     for (name, value) in given {
-        // `init_ply` is an alias of `init`.
-        let name = if name == "init_ply" {
-            "init".to_owned()
-        } else {
-            name
-        };
         let Some(place) = all.get_mut(&name) else {
             let names: Vec<&str> = all
                 .as_object()

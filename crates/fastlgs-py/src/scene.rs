@@ -2,21 +2,19 @@
 
 use crate::answer::Answer;
 use crate::camera::Camera;
-use crate::fork;
+use crate::object::Object;
 use crate::options::to_python;
 use crate::texts::Texts;
-use crate::{Error, to_py_error};
+use crate::{Error, fork, stage, to_py_error};
 use fastlgs::query::{ObjectQuery, Pixels, selection};
 use fastlgs_core::gaussians::rest_len;
 use fastlgs_grid::Grid;
-use fastlgs_grid::grid::Object;
 use fastlgs_grid::query::QueryConfig;
 use glam::Vec3;
 use image::RgbImage;
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray3};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use serde_json::json;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -40,7 +38,11 @@ impl PointArgument {
 /// A trained scene folder, opened on a device.
 #[pyclass(frozen, module = "fastlgs")]
 pub struct Scene {
-    opened: Mutex<Opened>,
+    /// The opened scene, until it is closed.
+    opened: Mutex<Option<Opened>>,
+    path: PathBuf,
+    /// Device that was asked for; stages that open the scene again use it too.
+    device: String,
 }
 
 /// The scene and its object table.
@@ -83,8 +85,13 @@ impl Scene {
         work: impl FnOnce(&mut Opened) -> fastlgs::Result<T> + Send,
     ) -> PyResult<T> {
         fork::check()?;
-        py.detach(|| work(&mut self.opened.lock().unwrap_or_else(PoisonError::into_inner)))
-            .map_err(to_py_error)
+        let with_opened = || {
+            let mut opened = self.opened.lock().unwrap_or_else(PoisonError::into_inner);
+            let closed =
+                || fastlgs::Error::Invalid("the scene is closed; open it again".to_owned());
+            work(opened.as_mut().ok_or_else(closed)?)
+        };
+        py.detach(with_opened).map_err(to_py_error)
     }
 }
 
@@ -138,15 +145,44 @@ impl Scene {
             let grid = scene.grid()?;
             Ok(Opened { scene, grid })
         };
+        let opened = py.detach(open).map_err(to_py_error)?;
         Ok(Self {
-            opened: Mutex::new(py.detach(open).map_err(to_py_error)?),
+            path: opened.scene.folder().root.clone(),
+            opened: Mutex::new(Some(opened)),
+            device: device.to_owned(),
         })
+    }
+
+    /// Frees the device and the memory of the scene. Later calls raise `Error`.
+    fn close(&self, py: Python<'_>) {
+        py.detach(|| {
+            drop(
+                self.opened
+                    .lock()
+                    .unwrap_or_else(PoisonError::into_inner)
+                    .take(),
+            )
+        });
+    }
+
+    fn __enter__(this: Py<Self>) -> Py<Self> {
+        this
+    }
+
+    fn __exit__(
+        &self,
+        py: Python<'_>,
+        _kind: &Bound<'_, PyAny>,
+        _value: &Bound<'_, PyAny>,
+        _traceback: &Bound<'_, PyAny>,
+    ) {
+        self.close(py);
     }
 
     /// The scene folder.
     #[getter]
-    fn path(&self, py: Python<'_>) -> PyResult<PathBuf> {
-        self.with(py, |opened| Ok(opened.scene.folder().root.clone()))
+    fn path(&self) -> PathBuf {
+        self.path.clone()
     }
 
     /// Name of the device.
@@ -253,23 +289,12 @@ impl Scene {
         })
     }
 
-    /// All objects and parts: id, parent (0 for none), support, views, area (largest share of a
-    /// photo), code.
+    /// All objects and parts.
     #[getter]
-    fn objects<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let area = |areas: &[f32]| areas.iter().fold(0.0f32, |most, area| most.max(*area));
-        let description = |o: &Object| json!({ "id": o.id, "parent": o.parent, "support": o.support, "views": o.views, "area": area(&o.areas), "code": o.code.to_array() });
-        to_python(
-            py,
-            &self.with(py, |opened| {
-                Ok(opened
-                    .grid
-                    .objects
-                    .iter()
-                    .map(description)
-                    .collect::<Vec<_>>())
-            })?,
-        )
+    fn objects(&self, py: Python<'_>) -> PyResult<Vec<Object>> {
+        self.with(py, |opened| {
+            Ok(opened.grid.objects.iter().map(Object::from).collect())
+        })
     }
 
     /// Returns the embeddings of an object's masks, (masks, numbers).
@@ -280,7 +305,7 @@ impl Scene {
                 .checked_sub(1)
                 .and_then(|k| opened.grid.objects.get(k));
             let unknown = || {
-                fastlgs::Error::Invalid(format!(
+                fastlgs::Error::NotFound(format!(
                     "there is no object {id}; the scene has {known} objects"
                 ))
             };
@@ -482,6 +507,108 @@ impl Scene {
             };
             let selected = selection::gaussians(gaussians, grid, ids);
             selection::export(&path, gaussians, &world, &selected, !rest)
+        })
+    }
+
+    /// Removes an object, by a text or its id, fills the gap, and writes a new scene folder.
+    #[pyo3(signature = (output, text = None, *, object = None, progress = None, **options))]
+    fn remove<'py>(
+        &self,
+        py: Python<'py>,
+        output: PathBuf,
+        text: Option<String>,
+        object: Option<u16>,
+        progress: Option<Py<PyAny>>,
+        options: Option<&Bound<'py, PyDict>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        if text.is_some() == object.is_some() {
+            return Err(Error::new_err(
+                "name the object in one way: by a text or by its id",
+            ));
+        }
+        let known = fastlgs::RemoveConfig {
+            scene: self.path.clone(),
+            output,
+            text,
+            object,
+            ..Default::default()
+        };
+        stage::with_options(
+            py,
+            &known,
+            options,
+            progress,
+            &self.device,
+            0,
+            fastlgs::remove,
+        )
+    }
+
+    /// Measures colour, and with a folder of labels the masks of queries, on held-out views.
+    #[pyo3(signature = (labels = None, *, progress = None, **options))]
+    fn evaluate<'py>(
+        &self,
+        py: Python<'py>,
+        labels: Option<PathBuf>,
+        progress: Option<Py<PyAny>>,
+        options: Option<&Bound<'py, PyDict>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let known = fastlgs::EvalConfig {
+            scene: self.path.clone(),
+            labels,
+            ..Default::default()
+        };
+        stage::with_options(
+            py,
+            &known,
+            options,
+            progress,
+            &self.device,
+            0,
+            fastlgs::eval,
+        )
+    }
+
+    /// Teaches a name by an example: an object id, pixels of a view, or a picture file. Later
+    /// queries find it, in all scenes with the same encoder.
+    #[pyo3(signature = (name, *, object = None, point = None, view = None, image = None))]
+    fn teach<'py>(
+        &self,
+        py: Python<'py>,
+        name: String,
+        object: Option<u16>,
+        point: Option<PointArgument>,
+        view: Option<String>,
+        image: Option<PathBuf>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let lesson = fastlgs::teach::TeachConfig {
+            name,
+            scene: self.path.clone(),
+            point: point.map(PointArgument::pixels).transpose()?,
+            view,
+            object,
+            image,
+        };
+        let taught = self.with(py, |opened| {
+            let taught = fastlgs::teach::teach_in(&mut opened.scene, &lesson)?;
+            opened.scene.drop_texts();
+            Ok(taught)
+        })?;
+        to_python(py, &taught)
+    }
+
+    /// Lists the taught names: name, examples, views and from.
+    fn names<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let names = fastlgs::names::Names::load().map_err(to_py_error)?;
+        to_python(py, &names.rows())
+    }
+
+    /// Removes a taught name and its examples.
+    fn forget(&self, py: Python<'_>, name: &str) -> PyResult<()> {
+        self.with(py, |opened| {
+            fastlgs::names::Names::change(|names| names.remove(name))?;
+            opened.scene.drop_texts();
+            Ok(())
         })
     }
 

@@ -4,7 +4,7 @@ use crate::{fork, options, to_py_error};
 use fastlgs::Run;
 use fastlgs::progress::{Message, Sink};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyBool, PyDict};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -106,11 +106,24 @@ fn wait(receiver: &mut Receiver<Event>) -> Result<Event, RecvTimeoutError> {
     receiver.recv_timeout(SIGNAL_INTERVAL)
 }
 
+/// Calls `progress` with an event. Returns false if it cancels the stage by returning `False`.
+fn call_progress(py: Python<'_>, progress: Option<&Py<PyAny>>, event: &Event) -> PyResult<bool> {
+    let Some(progress) = progress else {
+        return Ok(true);
+    };
+    let returned = progress.call1(py, (event.to_python(py)?,))?;
+    let is_false = returned
+        .bind(py)
+        .cast::<PyBool>()
+        .is_ok_and(|value| !value.is_true());
+    Ok(!is_false)
+}
+
 /// Runs `work` with the GIL released. `progress` is called with a dictionary for each event.
 ///
 /// # Errors
 /// Errors of the stage, exceptions of `progress`, and `KeyboardInterrupt`. The last two cancel the
-/// stage first.
+/// stage first. `Cancelled` if `progress` returns `False`.
 pub fn run<T: Send>(
     py: Python<'_>,
     progress: Option<Py<PyAny>>,
@@ -138,16 +151,18 @@ pub fn run<T: Send>(
         loop {
             let event = py.detach(|| wait(&mut receiver));
             let called = match &event {
-                Ok(event) => progress
-                    .as_ref()
-                    .map_or(Ok(()), |f| f.call1(py, (event.to_python(py)?,)).map(drop)),
-                Err(RecvTimeoutError::Timeout) => Ok(()),
+                Ok(event) => call_progress(py, progress.as_ref(), event),
+                Err(RecvTimeoutError::Timeout) => Ok(true),
                 Err(RecvTimeoutError::Disconnected) => break,
             };
             // The first interruption cancels the stage. Later ones are ignored until it has ended.
-            if let (Err(error), None) = (called.and_then(|()| py.check_signals()), &interruption) {
-                interruption = Some(error);
-                cancelled.store(true, Ordering::Relaxed);
+            match called.and_then(|continues| py.check_signals().map(|()| continues)) {
+                Ok(true) => {}
+                Ok(false) => cancelled.store(true, Ordering::Relaxed),
+                Err(error) => {
+                    interruption.get_or_insert(error);
+                    cancelled.store(true, Ordering::Relaxed);
+                }
             }
         }
         let result = py.detach(|| thread.join());

@@ -3,6 +3,7 @@
 import json
 import os
 import pathlib
+import re
 import signal
 import threading
 
@@ -50,7 +51,7 @@ def test_questions_are_answered(scene):
     pointed = scene.query(point=(int(x), int(y)), view=view)
     assert pointed.found and pointed.mask[y, x]
     several = scene.query(point=[[int(x), int(y)], (int(x), int(y))], view=view)
-    assert [o["id"] for o in several.objects] == [o["id"] for o in pointed.objects]
+    assert [o.id for o in several.objects] == [o.id for o in pointed.objects]
     # A query by a picture.
     shown = scene.query(image=scene.render(view), view=view, false_alarms=1.0)
     assert shown.text == "image"
@@ -63,7 +64,7 @@ def test_arrays_are_those_of_the_scene(scene):
     assert {name: g[name].shape for name in shapes} == shapes and g["sh"].shape[::2] == (n, 3)
     assert (g["scales"] > 0).all() and ((g["opacities"] > 0) & (g["opacities"] < 1)).all()
     np.testing.assert_allclose(np.linalg.norm(g["rotations"], axis=1), 1, atol=1e-5)
-    leaf = next(o["id"] for o in scene.objects if o["id"] not in {p["parent"] for p in scene.objects})
+    leaf = next(o.id for o in scene.objects if o.id not in {p.parent for p in scene.objects})
     lists = scene.object_lists
     np.testing.assert_array_equal(scene.select([leaf]), np.flatnonzero([leaf in lists[i] for i in g["object_ids"]]))
     embeddings = scene.embeddings(leaf)
@@ -86,7 +87,7 @@ def test_cameras_of_either_convention_agree(scene):
 
 
 def test_selections_are_exported(scene, tmp_path):
-    first = scene.objects[0]["id"]
+    first = scene.objects[0].id
     scene.export(tmp_path / "one.ply", [first])
     scene.export(tmp_path / "rest.ply", [first], rest=True)
     assert (tmp_path / "one.ply").stat().st_size > 0 and (tmp_path / "rest.ply").stat().st_size > 0
@@ -108,6 +109,53 @@ def test_mistakes_are_named(scene, tmp_path):
     ]:
         with pytest.raises(fastlgs.Error, match=words):
             call()
+
+
+def test_what_does_not_exist_is_not_found(scene, tmp_path):
+    for call in [
+        lambda: scene.query("cat", view="nowhere.png"),
+        lambda: scene.embeddings(9999),
+        lambda: scene.teach("x", object=9999),
+        lambda: scene.remove(tmp_path / "without", object=9999),
+        lambda: scene.forget("never taught"),
+    ]:
+        with pytest.raises(fastlgs.NotFound):
+            call()
+
+
+def test_names_are_taught_and_forgotten(scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("FASTLGS_DATA", str(tmp_path))
+    example = scene.objects[0]
+    taught = scene.teach("Kocur", object=example.id)
+    assert taught["name"] == "kocur" and [row["name"] for row in scene.names()] == ["kocur"]
+    assert scene.query("kocur", false_alarms=1.0).objects[0].id == example.id
+    scene.forget("kocur")
+    assert scene.names() == []
+
+
+def test_an_object_is_removed_and_the_scene_evaluated(scene, tmp_path):
+    largest = max(scene.objects, key=lambda o: o.area)
+    removed = scene.remove(tmp_path / "without", object=largest.id)
+    assert largest.id in removed["objects"] and removed["removed"] > 0
+    assert scene.evaluate()["psnr"] > 15
+    with fastlgs.Scene(tmp_path / "without", device="cpu") as without:
+        assert len(without.objects) < len(scene.objects)
+    with pytest.raises(fastlgs.Error, match="closed"):
+        without.query("cat")
+
+
+def test_false_from_the_callback_cancels_a_stage(scene):
+    with pytest.raises(fastlgs.Cancelled):
+        fastlgs.train(scene.path, iterations=200_000, device="cpu", progress=lambda event: False)
+
+
+def test_stubs_name_what_the_package_has():
+    stub = (pathlib.Path(fastlgs.__file__).parent / "__init__.pyi").read_text()
+    for name in fastlgs.__all__:
+        assert re.search(rf"^(class|def) {name}\b|^{name}:", stub, re.M), name
+    for name in dir(fastlgs.Scene):
+        if not name.startswith("_"):
+            assert re.search(rf"^    def {name}\(", stub, re.M), name
 
 
 def test_ctrl_c_and_a_callback_that_raises_end_a_stage(scene, tmp_path):
@@ -150,8 +198,8 @@ def test_own_masks_and_embeddings(scene, tmp_path):
     """Masks and embeddings come from the caller, as from a segmenter and CLIP in Python."""
     photos = tmp_path / "photos"
     fastlgs.synth("room", photos, views=16, size=(160, 120))
-    largest = sorted(scene.objects, key=lambda o: -o["area"])[:6]
-    things = {f"thing {k}": o["id"] for k, o in enumerate(largest)}
+    largest = sorted(scene.objects, key=lambda o: -o.area)[:6]
+    things = {f"thing {k}": o.id for k, o in enumerate(largest)}
     drawn = {name: scene.render(name, "objects") for name in scene.views}
 
     def embed_text(texts):

@@ -78,8 +78,9 @@ impl From<QueryRejection> for Failure {
 
 impl From<fastlgs::Error> for Failure {
     fn from(error: fastlgs::Error) -> Self {
-        if let fastlgs::Error::Invalid(reason) = &error {
-            return Self::bad_request(reason.clone());
+        use fastlgs::Error::{Invalid, NotFound, Option};
+        if matches!(error, Invalid(_) | NotFound(_) | Option { .. }) {
+            return Self::bad_request(error.to_string());
         }
         anyhow::Error::from(error).into()
     }

@@ -85,7 +85,7 @@ impl Guard {
                 return Some(Failure::new(
                     StatusCode::FORBIDDEN,
                     format!(
-                        "this server does not accept the host name '{name}'; use its loopback address, or start it with --host-name {bare} if that is a proxy"
+                        "this server does not accept the host name '{name}'; use its loopback address, or set the option host_name to {bare} if that is a proxy"
                     ),
                 ));
             }

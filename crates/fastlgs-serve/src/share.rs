@@ -78,7 +78,7 @@ pub fn share(config: &ShareConfig, run: &Run) -> Result<ShareReport> {
             .map_or(true, |mut entries| entries.next().is_some())
     {
         bail!(
-            "{}: exists and is not an export with --html; choose another folder",
+            "{}: exists and holds no exported page; choose another folder",
             root.display()
         );
     }

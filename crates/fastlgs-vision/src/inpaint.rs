@@ -138,7 +138,7 @@ pub fn by_name(name: &str) -> Result<Box<dyn Inpainter>> {
         #[cfg(feature = "opencv")]
         "opencv" => Ok(Box::new(Telea)),
         #[cfg(not(feature = "opencv"))]
-        "opencv" => Err(Error::Invalid("this build has no OpenCV; build with --features opencv, or use the inpainter 'membrane'".to_owned())),
+        "opencv" => Err(Error::Invalid("this build has no OpenCV; build with the feature opencv, or use the inpainter 'membrane'".to_owned())),
         path if Path::new(path).extension().is_some_and(|e| e.eq_ignore_ascii_case("onnx")) => {
             Ok(Box::new(Learned::load(Path::new(path))?))
         }

@@ -265,7 +265,7 @@ impl Puller<'_> {
                     if let Err(why) = check(file, &partial, expected) {
                         let _ = std::fs::remove_file(&partial);
                         return Err(Error::Missing(format!(
-                            "{url}: {why}; the file was not installed; try another mirror with --base-url, or download the file manually"
+                            "{url}: {why}; the file was not installed; set base_url to another mirror, or download the file manually"
                         )));
                     }
                     return Ok(partial);
@@ -346,7 +346,7 @@ enum Transfer {
 
 fn unreachable(url: &str, e: &ureq::Error) -> Error {
     Error::Missing(format!(
-        "{url}: cannot be reached ({e}); check the connection or HTTPS_PROXY, or name a mirror with --base-url"
+        "{url}: cannot be reached ({e}); check the connection or HTTPS_PROXY, or set base_url to a mirror"
     ))
 }
 

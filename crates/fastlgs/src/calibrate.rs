@@ -68,7 +68,7 @@ pub fn calibrate(choice: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
     let clock = Instant::now();
     if choice.encoder != EncoderKind::Clip {
         bail!(
-            "only CLIP can be calibrated: the offline encoder is calibrated already, and imported embeddings cannot be; choose the towers with --clip, or with --clip-image and --clip-text"
+            "only CLIP can be calibrated: the offline encoder is calibrated already, and imported embeddings cannot be; set clip, or clip_image and clip_text, to choose the towers"
         );
     }
     let image_tower = choice.clip_files()?[0].clone();

@@ -30,7 +30,18 @@ pub enum Error {
     /// Intermediate result that cannot be stored in the cache.
     #[error(transparent)]
     Cache(#[from] postcard::Error),
-    /// Invalid input or options.
+    /// A view, object or name that does not exist.
+    #[error("{0}")]
+    NotFound(String),
+    /// A field of a configuration with a value that cannot be used.
+    #[error("{option}: {reason}")]
+    Option {
+        /// Name of the field.
+        option: &'static str,
+        /// Reason, with the names and values of other fields that solve it.
+        reason: String,
+    },
+    /// Invalid input.
     #[error("{0}")]
     Invalid(String),
     /// Step that failed, with its cause.
@@ -92,6 +103,14 @@ impl<T> Context<T> for Option<T> {
 
     fn with_context<S: Display>(self, what: impl FnOnce() -> S) -> Result<T> {
         self.ok_or_else(|| Error::Invalid(what().to_string()))
+    }
+}
+
+impl Error {
+    /// Creates an [`Error::Option`].
+    pub(crate) fn option(option: &'static str, reason: impl Into<String>) -> Self {
+        let reason = reason.into();
+        Self::Option { option, reason }
     }
 }
 

@@ -1,7 +1,7 @@
 //! Choice of segmenter and encoders: options of `preprocess`, afterwards read from `scene.json`.
 
 use crate::error::{Context, bail};
-use crate::{Result, calibrations};
+use crate::{Error, Result, calibrations};
 use fastlgs_core::scene_folder::{Manifest, ModelFile};
 use fastlgs_core::{Camera, LabelMap, Level, MaskList, SceneFolder};
 use fastlgs_grid::mapping::Mask;
@@ -170,23 +170,27 @@ impl ModelChoice {
     /// Checks that no option is set that the chosen segmenter and encoder ignore.
     pub(crate) fn check(&self) -> Result<()> {
         let of_sam = [
-            ("--sam-encoder", self.sam_encoder.is_some()),
-            ("--sam-decoder", self.sam_decoder.is_some()),
-            ("--sam-points", self.sam_points.is_some()),
-            ("--sam-iou", self.sam_iou.is_some()),
-            ("--sam-stability", self.sam_stability.is_some()),
+            ("sam_encoder", self.sam_encoder.is_some()),
+            ("sam_decoder", self.sam_decoder.is_some()),
+            ("sam_points", self.sam_points.is_some()),
+            ("sam_iou", self.sam_iou.is_some()),
+            ("sam_stability", self.sam_stability.is_some()),
         ];
         if let Some((option, _)) = of_sam
-            .iter()
+            .into_iter()
             .find(|(_, is_set)| *is_set && self.segmenter != SegmenterKind::Sam)
         {
-            bail!("{option} is for SAM: add --segmenter sam");
+            return Err(Error::option(
+                option,
+                "this is for SAM; set segmenter to sam",
+            ));
         }
+        let for_clip = "this is for CLIP; set encoder to clip";
         if self.encoder != EncoderKind::Clip && self.clip_image.is_some() {
-            bail!("--clip-image is for CLIP: add --encoder clip");
+            return Err(Error::option("clip_image", for_clip));
         }
         if self.encoder == EncoderKind::Offline && self.clip_text.is_some() {
-            bail!("--clip-text is for CLIP: add --encoder clip");
+            return Err(Error::option("clip_text", for_clip));
         }
         Ok(())
     }
@@ -202,14 +206,18 @@ impl ModelChoice {
     pub(crate) fn clip_files(&self) -> Result<[PathBuf; 2]> {
         Ok(match (&self.clip_image, &self.clip_text) {
             (Some(image), Some(text)) => [image.clone(), text.clone()],
-            (None, Some(text)) => bail!(
-                "{}: a text tower needs the image tower that belongs to it: --clip-image FILE",
-                text.display()
-            ),
-            (Some(image), None) => bail!(
-                "{}: an image tower needs the text tower that belongs to it: --clip-text FILE",
-                image.display()
-            ),
+            (None, Some(text)) => {
+                return Err(Error::option(
+                    "clip_image",
+                    format!("name the image tower that belongs to {}", text.display()),
+                ));
+            }
+            (Some(image), None) => {
+                return Err(Error::option(
+                    "clip_text",
+                    format!("name the text tower that belongs to {}", image.display()),
+                ));
+            }
             (None, None) => ModelPair::find(&self.clip)?.pair()?,
         })
     }
@@ -273,9 +281,12 @@ impl ModelChoice {
         Ok(match (self.encoder, &self.clip_text) {
             (EncoderKind::Clip, _) => Box::new(ClipText::load(&self.clip_files()?[1])?),
             (EncoderKind::Import, Some(text)) => Box::new(ClipText::load(text)?),
-            (EncoderKind::Import, None) => bail!(
-                "imported embeddings need the text tower that belongs to them: --clip-text FILE"
-            ),
+            (EncoderKind::Import, None) => {
+                return Err(Error::option(
+                    "clip_text",
+                    "name the text tower that belongs to the imported embeddings",
+                ));
+            }
             (EncoderKind::Offline, _) => Box::new(OfflineText::load()?),
         })
     }
@@ -413,7 +424,7 @@ pub fn check_version(manifest: &Manifest, grid: &Grid, folder: &SceneFolder) -> 
         let root = folder.root.display();
         bail!(
             "{root}: its objects were embedded by another encoder, or by another version of the encoder; \
-             run 'fastlgs train {root} --init {root}/scene.ply --iterations 0' to embed them again and keep the Gaussians"
+             train it again with init set to {root}/scene.ply and iterations to 0, which keeps the Gaussians"
         );
     }
     Ok(())
@@ -472,9 +483,12 @@ pub fn text_encoder_of(
         ("import", None) if manifest.models.contains_key("clip_text") => {
             Box::new(ClipText::load(recorded_model(manifest, "clip_text")?)?)
         }
-        ("import", None) => bail!(
-            "the scene's embeddings were imported: name the text tower that belongs to them with --clip-text FILE"
-        ),
+        ("import", None) => {
+            return Err(Error::option(
+                "clip_text",
+                "name the text tower that belongs to the imported embeddings of the scene",
+            ));
+        }
         (other, None) => bail!(
             "the embeddings of the scene come from the encoder '{other}', which this version does not know; update FastLGS"
         ),

@@ -1,7 +1,7 @@
 //! Taught names: examples of objects under a name, for all scenes with the same encoder.
 
-use crate::Result;
 use crate::error::{Context, bail};
+use crate::{Error, Result};
 use fastlgs_core::fs;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -131,9 +131,9 @@ impl Names {
     pub fn remove(&mut self, name: &str) -> Result<()> {
         match self.0.remove(&normalise_name(name)) {
             Some(_) => Ok(()),
-            None => {
-                bail!("'{name}' was never taught; run 'fastlgs names list' to see all taught names")
-            }
+            None => Err(Error::NotFound(format!(
+                "'{name}' was never taught; run 'fastlgs names list' to see all taught names"
+            ))),
         }
     }
 

@@ -191,11 +191,10 @@ impl Scene {
             return Ok(grid.clone());
         }
         if !self.folder.is_compact() && !ply::has_object_ids(&self.folder.ply_path())? {
-            let (path, root) = (self.folder.ply_path(), self.folder.root.display());
+            let path = self.folder.ply_path();
             bail!(
                 "{}: another program saved this file without the column object_id, so the objects are lost; \
-                 run 'fastlgs train {root} --init {} --iterations 0' to find them again and keep the Gaussians",
-                path.display(),
+                 train the scene again with init set to this file and iterations to 0, which keeps the Gaussians",
                 path.display()
             );
         }

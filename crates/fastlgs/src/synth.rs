@@ -86,8 +86,9 @@ pub struct SynthReport {
 pub fn synth(config: &SynthConfig, run: &Run) -> Result<SynthReport> {
     let kind = Kind::of(&config.kind).with_context(|| {
         format!(
-            "'{}' is not a kind of generated scene; 'fastlgs synth --help' lists all kinds",
-            config.kind
+            "'{}' is not a kind of generated scene; the kinds are {}",
+            config.kind,
+            KINDS.map(|kind| kind.0).join(", ")
         )
     })?;
     let views = config.views.unwrap_or(kind.views());

@@ -4,12 +4,12 @@ use crate::error::{Context, bail};
 use crate::names::{Example, Names, normalise_name};
 use crate::query::Pixels;
 use crate::query::object_query::{ObjectQuery, picture_query};
-use crate::{Result, Run, Scene, model_choice};
+use crate::{Error, Result, Run, Scene, model_choice};
 use fastlgs_core::image_io;
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::QueryConfig;
 use serde::{Deserialize, Serialize};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// A name and one example: `point` (with `view`), `object` or `image`.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -58,34 +58,27 @@ pub struct TeachReport {
 /// An empty name, an example without an object, none or several examples, or a file that cannot be
 /// written. The names then remain unchanged.
 pub fn teach(config: &TeachConfig, run: &Run) -> Result<TeachReport> {
-    let mut scene = Scene::open(&config.scene, run.device)?;
+    teach_in(&mut Scene::open(&config.scene, run.device)?, config)
+}
+
+/// Teaches a name by an example in an opened scene; `config.scene` is ignored.
+///
+/// # Errors
+/// As [`teach`].
+pub fn teach_in(scene: &mut Scene, config: &TeachConfig) -> Result<TeachReport> {
     let object = match (config.object, &config.point, &config.image) {
-        (Some(id), None, None) => Some(id),
-        (None, Some(pixels), None) => Some(object_at(&mut scene, config, pixels)?),
-        (None, None, Some(_)) => None,
+        (Some(id), None, None) => id,
+        (None, Some(pixels), None) => object_at(scene, config, pixels)?,
+        (None, None, Some(path)) => {
+            let name = path.display().to_string();
+            let embeddings = picture_query(scene, &name, &image_io::load_rgb(path)?)?.positive;
+            return store_example(scene, &config.name, None, name, embeddings);
+        }
         _ => {
-            bail!("give exactly one example: --point X,Y with --view, --object ID, or --image FILE")
+            bail!("give exactly one example: a point with its view, an object, or an image")
         }
     };
-    match (object, &config.image) {
-        (Some(id), _) => teach_object(&scene, &*scene.grid()?, &config.name, id),
-        (None, Some(path)) => {
-            let embeddings = picture_query(
-                &scene,
-                &path.display().to_string(),
-                &image_io::load_rgb(path)?,
-            )?
-            .positive;
-            store_example(
-                &scene,
-                &config.name,
-                None,
-                path.display().to_string(),
-                embeddings,
-            )
-        }
-        (None, None) => bail!("no example is given; name an object or a picture"),
-    }
+    teach_object(scene, &*scene.grid()?, &config.name, object)
 }
 
 /// Teaches `name` by the object `id` of `grid`, the object table of the scene.
@@ -95,15 +88,10 @@ pub fn teach(config: &TeachConfig, run: &Run) -> Result<TeachReport> {
 pub fn teach_object(scene: &Scene, grid: &Grid, name: &str, id: u16) -> Result<TeachReport> {
     model_choice::check_version(scene.manifest(), grid, scene.folder())?;
     let root = scene.folder().root.display().to_string();
-    let Some(object) = usize::from(id)
+    let object = usize::from(id)
         .checked_sub(1)
-        .and_then(|k| grid.objects.get(k))
-    else {
-        bail!(
-            "{root}: its object ids are 1 to {}, and none is {id}; choose one of them",
-            grid.objects.len()
-        )
-    };
+        .and_then(|k| grid.objects.get(k));
+    let object = object.ok_or_else(|| no_object(&scene.folder().root, grid, id))?;
     store_example(
         scene,
         name,
@@ -111,6 +99,15 @@ pub fn teach_object(scene: &Scene, grid: &Grid, name: &str, id: u16) -> Result<T
         format!("object {id} of {root}"),
         object.embeddings.clone(),
     )
+}
+
+/// Returns the error for an object id that the scene in `root` does not have.
+pub(crate) fn no_object(root: &Path, grid: &Grid, id: u16) -> Error {
+    Error::NotFound(format!(
+        "{}: its object ids are 1 to {}, and none is {id}; choose one of them",
+        root.display(),
+        grid.objects.len()
+    ))
 }
 
 fn store_example(
@@ -164,11 +161,11 @@ fn object_at(scene: &mut Scene, config: &TeachConfig, pixels: &Pixels) -> Result
         &camera,
         &QueryConfig::default(),
     )?;
-    let nothing = || {
-        format!(
+    let target = found.targets.first().ok_or_else(|| {
+        Error::NotFound(format!(
             "there is no object at {pixels} of '{}'; choose other pixels",
             camera.name
-        )
-    };
-    Ok(found.targets.first().with_context(nothing)?.id)
+        ))
+    })?;
+    Ok(target.id)
 }

@@ -1,10 +1,38 @@
 """Open-vocabulary 3-D scenes: build them from photos, and find objects in them by text."""
 
 from . import _fastlgs, own
-from ._fastlgs import Answer, Camera, Error, Scene, __version__, make, synth, train
+from ._fastlgs import (
+    Answer,
+    Camera,
+    Cancelled,
+    Error,
+    FoundObject,
+    NotFound,
+    Object,
+    Scene,
+    __version__,
+    make,
+    synth,
+    train,
+)
 from .own import write_masks
 
-__all__ = ["Answer", "Camera", "Error", "Scene", "__version__", "make", "preprocess", "synth", "train", "write_masks"]
+__all__ = [
+    "Answer",
+    "Camera",
+    "Cancelled",
+    "Error",
+    "FoundObject",
+    "NotFound",
+    "Object",
+    "Scene",
+    "__version__",
+    "make",
+    "preprocess",
+    "synth",
+    "train",
+    "write_masks",
+]
 
 
 def preprocess(photos, output, *, masks=None, **options):

@@ -1,22 +1,58 @@
 import pathlib
-from os import PathLike
 from typing import Any, Callable, Dict, Iterable, List, Literal, Mapping, Optional, Sequence, Tuple, Union
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Unpack
+
+from .options import EvaluateOptions, Path, PreprocessOptions, RemoveOptions, SynthOptions, TrainOptions
 
 __version__: str
 
-Path = Union[str, "PathLike[str]"]
 View = Union[str, "Camera"]
 Progress = Callable[[Dict[str, Any]], object]
-"""Receives {"stage", "done", "total", "note"} or {"warning"}.
+"""Receives {"stage", "done", "total", "note"} or {"warning"}. Returning False cancels the stage.
 
 Events of training have "loss", "psnr" and "gaussians" instead of "note".
 """
 
 class Error(Exception):
     """An error of the pipeline: one sentence that names the file and the solution."""
+
+class NotFound(Error):
+    """A view, object or name that does not exist."""
+
+class Cancelled(Error):
+    """The progress callback cancelled the stage."""
+
+class Object:
+    """An object or part of a scene."""
+
+    id: int
+    parent: int
+    """Id of the object that it is a part of; 0 for none."""
+    support: float
+    """Mean IoU with the best mask of each view, 0 to 1."""
+    views: int
+    """Number of views that show it."""
+    area: float
+    """Largest share of a photo."""
+    code: Tuple[float, float, float]
+
+class FoundObject:
+    """An object of an answer."""
+
+    id: int
+    parent: int
+    support: float
+    score: float
+    """0 to 1."""
+    bbox2d: Optional[Tuple[int, int, int, int]]
+    """Left, top, right and bottom in pixels of the view, the last two exclusive."""
+    bbox3d: Optional[Tuple[List[float], List[float]]]
+    """Minimum and maximum corner in world coordinates, without outliers."""
+    pixels: int
+    gaussians: int
 
 class Camera:
     """An undistorted pinhole camera: x right, y down, looking along +z (OpenCV)."""
@@ -82,8 +118,7 @@ class Answer:
     def relevancy(self) -> NDArray[np.float32]:
         """Confidence of the object at each pixel, 0 to 1; (height, width)."""
     @property
-    def objects(self) -> List[Dict[str, Any]]:
-        """Objects of the answer: id, parent, support, score, bbox2d, bbox3d, pixels, gaussians."""
+    def objects(self) -> List[FoundObject]: ...
     @property
     def report(self) -> Dict[str, Any]:
         """The report of the answer, as `fastlgs query --json` prints it."""
@@ -134,11 +169,8 @@ class Scene:
         (height, width, 3).
         """
     @property
-    def objects(self) -> List[Dict[str, Any]]:
-        """All objects and parts: id, parent (0 for none), support, views, area, code.
-
-        `area` is the largest share of a photo.
-        """
+    def objects(self) -> List[Object]:
+        """All objects and parts."""
     def embeddings(self, id: int) -> NDArray[np.float32]:
         """Returns the embeddings of an object's masks, (masks, numbers).
 
@@ -172,6 +204,51 @@ class Scene:
 
         Without `ids`, writes all Gaussians.
         """
+    def remove(
+        self,
+        output: Path,
+        text: Optional[str] = None,
+        *,
+        object: Optional[int] = None,
+        progress: Optional[Progress] = None,
+        **options: Unpack[RemoveOptions],
+    ) -> Dict[str, Any]:
+        """Removes an object, by a text or its id, fills the gap, and writes a new scene folder.
+
+        Raises NotFound if there is no such object.
+        """
+    def evaluate(
+        self,
+        labels: Optional[Path] = None,
+        *,
+        progress: Optional[Progress] = None,
+        **options: Unpack[EvaluateOptions],
+    ) -> Dict[str, Any]:
+        """Measures colour, and with a folder of labels the masks of queries, on held-out views."""
+    def teach(
+        self,
+        name: str,
+        *,
+        object: Optional[int] = None,
+        point: Union[None, Tuple[int, int], Sequence[Tuple[int, int]]] = None,
+        view: Optional[str] = None,
+        image: Optional[Path] = None,
+    ) -> Dict[str, Any]:
+        """Teaches a name by one example: an object id, pixels of a view, or a picture file.
+
+        Later queries find it, in all scenes with the same encoder.
+        """
+    def names(self) -> List[Dict[str, Any]]:
+        """Lists the taught names: name, examples, views and from."""
+    def forget(self, name: str) -> None:
+        """Removes a taught name and its examples."""
+    def close(self) -> None:
+        """Frees the device and the memory of the scene. Later calls raise Error.
+
+        A `with` statement closes the scene at its end.
+        """
+    def __enter__(self) -> "Scene": ...
+    def __exit__(self, *exception: Any) -> None: ...
 
 def make(
     photos: Path,
@@ -181,7 +258,7 @@ def make(
     device: str = "auto",
     seed: int = 0,
     effort: Optional[Literal["quick", "standard", "paper", "like-paper"]] = None,
-    **options: Any,
+    **options: Unpack[PreprocessOptions],
 ) -> Dict[str, Any]:
     """Makes a queryable scene from photos.
 
@@ -202,7 +279,7 @@ def preprocess(
     progress: Optional[Progress] = None,
     device: str = "auto",
     seed: int = 0,
-    **options: Any,
+    **options: Unpack[PreprocessOptions],
 ) -> Dict[str, Any]:
     """Computes masks, key points, poses and points from photos.
 
@@ -218,14 +295,14 @@ def write_masks(
 ) -> None:
     """Writes the masks of a photo, and an embedding for each, for import by `preprocess`."""
 
-def train(scene: Path, *, progress: Optional[Progress] = None, device: str = "auto", seed: int = 0, **options: Any) -> Dict[str, Any]:
+def train(scene: Path, *, progress: Optional[Progress] = None, device: str = "auto", seed: int = 0, **options: Unpack[TrainOptions]) -> Dict[str, Any]:
     """Trains Gaussians and finds objects.
 
     Options are those of `fastlgs train`, with underscores.
     """
 
 def synth(
-    kind: str, output: Path, *, progress: Optional[Progress] = None, device: str = "auto", seed: int = 0, **options: Any
+    kind: str, output: Path, *, progress: Optional[Progress] = None, device: str = "auto", seed: int = 0, **options: Unpack[SynthOptions]
 ) -> Dict[str, Any]:
     """Generates photos with exact poses, depths and masks.
 

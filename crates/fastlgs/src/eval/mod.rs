@@ -228,7 +228,7 @@ pub fn eval_scene(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport> {
         let camera = scene.cameras()[index].clone();
         if !scene.manifest().is_held_out(index, &camera.name) {
             bail!(
-                "'{}' has labels but was trained on; preprocess the photos again with --holdout or --holdout-labels, so that it is held out",
+                "'{}' has labels but was trained on; preprocess the photos again with holdout or holdout_labels, so that it is held out",
                 camera.name
             );
         }

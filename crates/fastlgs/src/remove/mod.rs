@@ -14,7 +14,8 @@ use crate::error::{Context, bail};
 use crate::output::{SceneLock, resolve_path};
 use crate::query::object_query::ObjectQuery;
 use crate::query::selection;
-use crate::{Result, Run, Scene, transparent};
+use crate::teach::no_object;
+use crate::{Error, Result, Run, Scene, transparent};
 use fastlgs_core::{Camera, SceneFolder, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
@@ -260,10 +261,7 @@ fn targets(config: &RemoveConfig, scene: &mut Scene, grid: &Grid) -> Result<Vec<
     let root = config.scene.display();
     if let Some(id) = config.object {
         if id == 0 || usize::from(id) > grid.objects.len() {
-            bail!(
-                "{root}: its object ids are 1 to {}, and none is {id}; choose one of them",
-                grid.objects.len()
-            );
+            return Err(no_object(&config.scene, grid, id));
         }
         return Ok(vec![Hit { id, score: 1.0 }]);
     }
@@ -281,9 +279,9 @@ fn targets(config: &RemoveConfig, scene: &mut Scene, grid: &Grid) -> Result<Vec<
         &QueryConfig::default(),
     )?;
     if found.targets.is_empty() {
-        bail!(
-            "{root}: '{text}' is not found; name the object by its id with --object ('fastlgs query --point X,Y' reports ids)"
-        );
+        return Err(Error::NotFound(format!(
+            "{root}: '{text}' is not found; name the object by its id, which a query by a pixel reports"
+        )));
     }
     Ok(found.targets)
 }

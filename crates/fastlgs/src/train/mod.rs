@@ -9,10 +9,10 @@ mod report;
 mod run;
 mod settings;
 
-use crate::error::{Context, bail};
+use crate::error::Context;
 use crate::output::SceneLock;
 use crate::staged::StagedOutput;
-use crate::{Result, Run, SceneNotes, checkpoints, objects, transparent};
+use crate::{Error, Result, Run, SceneNotes, checkpoints, objects, transparent};
 pub use config::{
     Align, Background, Borders, Cue, Exposures, FeatureMode, Mapping, Preset, TrainConfig,
 };
@@ -60,19 +60,22 @@ pub(crate) fn train_locked(
 fn check(config: &TrainConfig) -> Result<()> {
     let trains_features = config.feature_mode == FeatureMode::Train;
     if config.preset == Preset::LikePaper && config.mapping == Mapping::Keep {
-        bail!(
-            "preset 'like-paper' finds objects by Algorithm 1 and cannot keep existing ones: omit mapping 'keep', or choose another preset"
-        );
+        return Err(Error::option(
+            "preset",
+            "'like-paper' finds objects by Algorithm 1 and cannot keep existing ones; omit mapping 'keep', or choose another preset",
+        ));
     }
     if trains_features && config.mapping == Mapping::Global {
-        bail!(
-            "--feature-mode train needs the objects before training: add --mapping paper, or keep those of a trained scene (--mapping keep)"
-        );
+        return Err(Error::option(
+            "feature_mode",
+            "'train' needs the objects before training; set mapping to paper, or to keep for those of a trained scene",
+        ));
     }
     if config.freeze && !trains_features {
-        bail!(
-            "freeze trains features only: set feature_mode to train, and mapping to paper or keep; to lift objects without training, set iterations to 0"
-        );
+        return Err(Error::option(
+            "freeze",
+            "this trains features only; set feature_mode to train, and mapping to paper or keep; to lift objects without training, set iterations to 0",
+        ));
     }
     Ok(())
 }
