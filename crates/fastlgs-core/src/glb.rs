@@ -206,6 +206,104 @@ fn chunks<'a>(path: &Path, data: &'a [u8]) -> Result<(Value, &'a [u8])> {
     Ok((document, data.get(20 + length + 8..).unwrap_or_default()))
 }
 
+/// Attributes of the first mesh of Gaussians in a document.
+struct Attributes<'a> {
+    path: &'a Path,
+    document: &'a Value,
+    /// The binary chunk.
+    body: &'a [u8],
+    /// Accessor of each attribute.
+    accessors: &'a Value,
+}
+
+impl<'a> Attributes<'a> {
+    fn find(path: &'a Path, document: &'a Value, body: &'a [u8]) -> Result<Self> {
+        let meshes = document["meshes"].as_array().into_iter().flatten();
+        let mut primitives = meshes
+            .flat_map(|mesh| mesh["primitives"].as_array())
+            .flatten();
+        let has_gaussians =
+            |primitive: &&Value| primitive["extensions"]["KHR_gaussian_splatting"].is_object();
+        let primitive = primitives.find(has_gaussians).ok_or_else(|| {
+            Error::format(path, "it has no mesh of Gaussians (KHR_gaussian_splatting)")
+        })?;
+        Ok(Self {
+            path,
+            document,
+            body,
+            accessors: &primitive["attributes"],
+        })
+    }
+
+    /// Returns the values of an attribute with `width` floats for each Gaussian, if it has one.
+    fn values(&self, name: &str, width: usize) -> Result<Option<Vec<f32>>> {
+        let bad = |reason: String| Error::format(self.path, reason);
+        let Some(accessor) = self.accessors[name].as_u64() else {
+            return Ok(None);
+        };
+        let accessor = &self.document["accessors"][accessor as usize];
+        if accessor["componentType"] != FLOAT {
+            return Err(bad(format!(
+                "{name} is not stored as floats; export it uncompressed"
+            )));
+        }
+        let view = accessor["bufferView"].as_u64().unwrap_or(u64::MAX) as usize;
+        let view = &self.document["bufferViews"][view];
+        let offset = |value: &Value| value["byteOffset"].as_u64().unwrap_or(0) as usize;
+        let start = offset(view).saturating_add(offset(accessor));
+        let stride = view["byteStride"].as_u64().unwrap_or(0) as usize;
+        let stride = stride.max(4 * width);
+        let row = |i: usize| {
+            let at = i.checked_mul(stride)?.checked_add(start)?;
+            self.body.get(at..at.checked_add(4 * width)?)
+        };
+        let mut values = Vec::new();
+        for i in 0..accessor["count"].as_u64().unwrap_or(0) as usize {
+            let row =
+                row(i).ok_or_else(|| bad(format!("{name} is cut off; copy the file again")))?;
+            let floats = row.chunks_exact(4);
+            values.extend(floats.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])));
+        }
+        Ok(Some(values))
+    }
+
+    /// Returns the values of an attribute of the extension, if it has one.
+    fn extension(&self, name: &str, width: usize) -> Result<Option<Vec<f32>>> {
+        self.values(&format!("KHR_gaussian_splatting:{name}"), width)
+    }
+
+    /// Returns the values of an attribute that every file has.
+    fn required(&self, name: &str, values: Result<Option<Vec<f32>>>) -> Result<Vec<f32>> {
+        values?.ok_or_else(|| {
+            let reason = format!("its Gaussians have no attribute {name}; export it again");
+            Error::format(self.path, reason)
+        })
+    }
+
+    fn required_extension(&self, name: &str, width: usize) -> Result<Vec<f32>> {
+        self.required(name, self.extension(name, width))
+    }
+
+    /// Returns the SH degree, and for each coefficient above degree 0 its values of all Gaussians.
+    fn harmonics(&self) -> Result<(u32, Vec<Vec<Vec3>>)> {
+        let (mut sh_degree, mut coefficients) = (0, Vec::new());
+        for degree in 1..=MAX_SH_DEGREE {
+            let count = rest_len(degree) - rest_len(degree - 1);
+            let found = (0..count)
+                .map(|k| self.extension(&format!("SH_DEGREE_{degree}_COEF_{k}"), 3))
+                .collect::<Result<Option<Vec<_>>>>()?;
+            let Some(found) = found else { break };
+            coefficients.extend(found.iter().map(|values| vec3(values)));
+            sh_degree = degree;
+        }
+        Ok((sh_degree, coefficients))
+    }
+}
+
+fn vec3(values: &[f32]) -> Vec<Vec3> {
+    values.chunks_exact(3).map(Vec3::from_slice).collect()
+}
+
 /// Reads the first mesh of Gaussians in a binary glTF file. Features are zero and object ids 0.
 ///
 /// Node transforms are ignored in files of FastLGS, which are in scene coordinates. Transforms in
@@ -216,128 +314,34 @@ fn chunks<'a>(path: &Path, data: &'a [u8]) -> Result<(Value, &'a [u8])> {
 pub fn read(path: &Path) -> Result<Gaussians> {
     let data = fs::read(path)?;
     let (document, body) = chunks(path, &data)?;
-    let bad = |reason: String| Error::format(path, reason);
-    let is_ours = document["asset"]["generator"]
-        .as_str()
-        .is_some_and(|name| name.starts_with("FastLGS"));
-    let moves = |node: &Value| {
-        ["matrix", "rotation", "translation", "scale"]
-            .iter()
-            .any(|part| !node[*part].is_null())
-    };
-    if !is_ours
-        && document["nodes"]
-            .as_array()
-            .into_iter()
-            .flatten()
-            .any(moves)
-    {
-        return Err(bad(
-            "a node transforms its Gaussians; apply the transforms in the program that wrote it and export it again".to_owned()
-        ));
-    }
-    let primitives = document["meshes"]
-        .as_array()
-        .into_iter()
-        .flatten()
-        .flat_map(|mesh| mesh["primitives"].as_array())
-        .flatten();
-    let with_gaussians =
-        |primitive: &&Value| primitive["extensions"]["KHR_gaussian_splatting"].is_object();
-    let names = primitives
-        .into_iter()
-        .find(with_gaussians)
-        .map(|primitive| &primitive["attributes"]);
-    let names = names
-        .ok_or_else(|| bad("it has no mesh of Gaussians (KHR_gaussian_splatting)".to_owned()))?;
-    let values = |name: &str, width: usize| -> Result<Option<Vec<f32>>> {
-        let Some(accessor) = names[name].as_u64() else {
-            return Ok(None);
-        };
-        let accessor = &document["accessors"][accessor as usize];
-        if accessor["componentType"] != FLOAT {
-            return Err(bad(format!(
-                "{name} is not stored as floats; export it uncompressed"
-            )));
-        }
-        let view =
-            &document["bufferViews"][accessor["bufferView"].as_u64().unwrap_or(u64::MAX) as usize];
-        let offset = |value: &Value| value["byteOffset"].as_u64().unwrap_or(0) as usize;
-        let (start, count) = (
-            offset(view).saturating_add(offset(accessor)),
-            accessor["count"].as_u64().unwrap_or(0) as usize,
-        );
-        let stride = view["byteStride"]
-            .as_u64()
-            .map_or(4 * width, |stride| stride as usize)
-            .max(4 * width);
-        let row = |i: usize| {
-            let at = i.checked_mul(stride)?.checked_add(start)?;
-            body.get(at..at.checked_add(4 * width)?)
-        };
-        let mut out = Vec::new();
-        for i in 0..count {
-            let row =
-                row(i).ok_or_else(|| bad(format!("{name} is cut off; copy the file again")))?;
-            out.extend(
-                row.chunks_exact(4)
-                    .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])),
-            );
-        }
-        Ok(Some(out))
-    };
-    let extension_attribute =
-        |name: &str, width: usize| values(&format!("KHR_gaussian_splatting:{name}"), width);
-    let required = |found: Option<Vec<f32>>, name: &str| {
-        found.ok_or_else(|| {
-            bad(format!(
-                "its Gaussians have no attribute {name}; export it again"
-            ))
-        })
-    };
-    let vec3 = |values: &[f32]| {
-        values
-            .chunks_exact(3)
-            .map(Vec3::from_slice)
-            .collect::<Vec<_>>()
-    };
-    let means = vec3(&required(values("POSITION", 3)?, "POSITION")?);
+    check_transforms(path, &document)?;
+    let attributes = Attributes::find(path, &document, body)?;
+    let means = attributes.required("POSITION", attributes.values("POSITION", 3))?;
+    let means = vec3(&means);
     let n = means.len();
-    let (mut sh_degree, mut coefficients) = (0, Vec::new());
-    for degree in 1..=MAX_SH_DEGREE {
-        let count = rest_len(degree) - rest_len(degree - 1);
-        let found = (0..count)
-            .map(|k| extension_attribute(&format!("SH_DEGREE_{degree}_COEF_{k}"), 3))
-            .collect::<Result<Option<Vec<_>>>>()?;
-        let Some(found) = found else { break };
-        coefficients.extend(found.iter().map(|values| vec3(values)));
-        sh_degree = degree;
-    }
+    let (sh_degree, coefficients) = attributes.harmonics()?;
+    let scales = vec3(&attributes.required_extension("SCALE", 3)?);
+    let rotations = attributes.required_extension("ROTATION", 4)?;
+    let opacities = attributes.required_extension("OPACITY", 1)?;
+    let colors = attributes.required_extension("SH_DEGREE_0_COEF_0", 3)?;
+    let of_gaussian = |i: usize| {
+        coefficients
+            .iter()
+            .map(move |values| values.get(i).copied().unwrap_or_default())
+    };
     let scene = Gaussians {
-        log_scales: vec3(&required(extension_attribute("SCALE", 3)?, "SCALE")?)
-            .into_iter()
-            .map(|s| s.map(f32::ln))
-            .collect(),
-        rotations: required(extension_attribute("ROTATION", 4)?, "ROTATION")?
+        log_scales: scales.into_iter().map(|s| s.map(f32::ln)).collect(),
+        rotations: rotations
             .chunks_exact(4)
             .map(|q| [q[3], q[0], q[1], q[2]])
             .collect(),
-        opacity_logits: required(extension_attribute("OPACITY", 1)?, "OPACITY")?
+        opacity_logits: opacities
             .into_iter()
             .map(|o| logit(o.clamp(0.001, 0.999)))
             .collect(),
-        sh_dc: vec3(&required(
-            extension_attribute("SH_DEGREE_0_COEF_0", 3)?,
-            "SH_DEGREE_0_COEF_0",
-        )?),
+        sh_dc: vec3(&colors),
         sh_degree,
-        sh_rest: (0..n)
-            .flat_map(|i| {
-                coefficients
-                    .iter()
-                    .map(move |values| values.get(i).copied().unwrap_or_default())
-            })
-            .collect(),
+        sh_rest: (0..n).flat_map(of_gaussian).collect(),
         features: vec![Vec3::ZERO; n],
         object_ids: vec![0; n],
         means,
@@ -349,11 +353,31 @@ pub fn read(path: &Path) -> Result<Gaussians> {
         scene.sh_dc.len(),
     ];
     if lengths.iter().any(|length| *length != n) {
-        return Err(bad(format!(
+        let reason = format!(
             "its attributes have {lengths:?} values, but it has {n} positions; export it again"
-        )));
+        );
+        return Err(Error::format(path, reason));
     }
     Ok(scene)
+}
+
+/// Refuses node transforms in files of other programs.
+fn check_transforms(path: &Path, document: &Value) -> Result<()> {
+    let generator = document["asset"]["generator"].as_str();
+    let is_ours = generator.is_some_and(|name| name.starts_with("FastLGS"));
+    let transforms = |node: &Value| {
+        ["matrix", "rotation", "translation", "scale"]
+            .iter()
+            .any(|part| !node[*part].is_null())
+    };
+    let mut nodes = document["nodes"].as_array().into_iter().flatten();
+    if !is_ours && nodes.any(transforms) {
+        return Err(Error::format(
+            path,
+            "a node transforms its Gaussians; apply the transforms in the program that wrote it and export it again",
+        ));
+    }
+    Ok(())
 }
 
 #[cfg(test)]

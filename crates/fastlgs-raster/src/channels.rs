@@ -24,6 +24,15 @@ impl Channels {
         self != Self::Color
     }
 
+    /// Returns whether a channel of a frame is included: colour is 0 to 2, the feature 3 to 5.
+    pub(crate) fn includes(self, channel: usize) -> bool {
+        match channel {
+            0..3 => self.color(),
+            3..6 => self.feature(),
+            _ => false,
+        }
+    }
+
     /// Returns the number of four-float groups in a gradient slot.
     pub(crate) fn slot(self) -> usize {
         if self.color() { 3 } else { 1 }

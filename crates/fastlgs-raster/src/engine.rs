@@ -26,11 +26,7 @@ pub struct Frame {
 
 /// Returns whether a channel of [`Frame`] is rendered.
 pub(crate) fn rendered(channels: Channels, channel: usize) -> bool {
-    match channel {
-        0..3 => channels.color(),
-        3..6 => channels.feature(),
-        _ => true,
-    }
+    channel >= 6 || channels.includes(channel)
 }
 
 impl Frame {
@@ -353,13 +349,7 @@ pub struct Memory {
 /// (3..6).
 pub(crate) fn planes(view: &View, options: &StepOptions) -> Vec<Plane> {
     let per_pixel = 1.0 / (3.0 * view.pixels() as f32);
-    let trained = |c: &usize| {
-        if *c < 3 {
-            options.channels.color()
-        } else {
-            options.channels.feature()
-        }
-    };
+    let trained = |c: &usize| options.channels.includes(*c);
     (0..6usize)
         .filter(trained)
         .map(|channel| Plane {
@@ -412,14 +402,19 @@ pub(crate) fn losses_from_sums(
             [0.0; 3]
         }
     };
-    let trained = |c: usize| if c < 3 { color } else { feature };
     Losses {
         color_l1: if color { mean(sums, 0) } else { 0.0 },
         color_ssim: if color { mean(ssim, 0) } else { 0.0 },
         feature_l1: if feature { mean(sums, 3) } else { 0.0 },
         by_gain: three(6),
         by_offset: three(12),
-        by_background: std::array::from_fn(|c| if trained(c) { sum(sums, 18 + c) } else { 0.0 }),
+        by_background: std::array::from_fn(|c| {
+            if channels.includes(c) {
+                sum(sums, 18 + c)
+            } else {
+                0.0
+            }
+        }),
     }
 }
 

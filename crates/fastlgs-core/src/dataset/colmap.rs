@@ -43,20 +43,92 @@ struct Point {
     images: Vec<u32>,
 }
 
-/// Names and parameter counts of COLMAP's camera models, indexed by model id.
-const MODELS: [(&str, usize); 11] = [
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
-];
+/// A camera model of COLMAP.
+struct Model {
+    name: &'static str,
+    projection: LensProjection,
+    /// Parameters in the order of the files, separated by spaces: focal lengths (f), principal point
+    /// (c), radial (k), tangential (p) and thin prism (s) coefficients, and those of the radial
+    /// denominator (d).
+    parameters: &'static str,
+}
+
+impl Model {
+    const fn new(name: &'static str, projection: LensProjection, parameters: &'static str) -> Self {
+        Self {
+            name,
+            projection,
+            parameters,
+        }
+    }
+
+    /// Number of parameters.
+    fn count(&self) -> usize {
+        self.parameters.split(' ').count()
+    }
+
+    /// Returns the lens with these parameters.
+    fn lens(&self, width: u64, height: u64, values: &[f64]) -> Lens {
+        let mut lens = Lens {
+            width: width as u32,
+            height: height as u32,
+            focal: [0.0; 2],
+            centre: [0.0; 2],
+            distortion: Distortion {
+                projection: self.projection,
+                ..Distortion::default()
+            },
+        };
+        for (name, &value) in self.parameters.split(' ').zip(values) {
+            let (distortion, single) = (&mut lens.distortion, value as f32);
+            match name {
+                "f" => lens.focal = [value; 2],
+                "fx" => lens.focal[0] = value,
+                "fy" => lens.focal[1] = value,
+                "cx" => lens.centre[0] = value,
+                "cy" => lens.centre[1] = value,
+                "k1" => distortion.k1 = single,
+                "k2" => distortion.k2 = single,
+                "k3" => distortion.k3 = single,
+                "k4" => distortion.k4 = single,
+                "p1" => distortion.p1 = single,
+                "p2" => distortion.p2 = single,
+                "s1" => distortion.prism[0] = single,
+                "s2" => distortion.prism[1] = single,
+                "d1" => distortion.radial_denominator[0] = single,
+                "d2" => distortion.radial_denominator[1] = single,
+                "d3" => distortion.radial_denominator[2] = single,
+                // A field of view of 0 means no distortion.
+                "fov" if value == 0.0 => {}
+                "fov" => distortion.projection = LensProjection::Fov(single),
+                other => unreachable!("the parameter {other}"),
+            }
+        }
+        lens
+    }
+}
+
+/// COLMAP's camera models, indexed by model id.
+const MODELS: [Model; 11] = {
+    use LensProjection::{Fisheye, None};
+    [
+        Model::new("SIMPLE_PINHOLE", None, "f cx cy"),
+        Model::new("PINHOLE", None, "fx fy cx cy"),
+        Model::new("SIMPLE_RADIAL", None, "f cx cy k1"),
+        Model::new("RADIAL", None, "f cx cy k1 k2"),
+        Model::new("OPENCV", None, "fx fy cx cy k1 k2 p1 p2"),
+        Model::new("OPENCV_FISHEYE", Fisheye, "fx fy cx cy k1 k2 k3 k4"),
+        Model::new("FULL_OPENCV", None, "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
+        Model::new("FOV", None, "fx fy cx cy fov"),
+        Model::new("SIMPLE_RADIAL_FISHEYE", Fisheye, "f cx cy k1"),
+        Model::new("RADIAL_FISHEYE", Fisheye, "f cx cy k1 k2"),
+        Model::new(
+            "THIN_PRISM_FISHEYE",
+            Fisheye,
+            "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s2",
+        ),
+    ]
+};
 
 /// Returns the number of images that the model in a folder registers; 0 if it cannot be read.
 pub fn registered_count(folder: &Path) -> usize {
@@ -166,131 +238,6 @@ fn posed(path: PathBuf, image: &Registered, lens: &Lens) -> PosedPhoto {
     }
 }
 
-/// Converts the parameters `p` of a COLMAP camera model, in COLMAP's order.
-fn lens(path: &Path, model: &str, width: u64, height: u64, p: &[f64]) -> Result<Lens> {
-    let d = |i: usize| p[i] as f32;
-    let none = Distortion::default();
-    let (focal, centre, distortion) = match model {
-        "SIMPLE_PINHOLE" => ([p[0], p[0]], [p[1], p[2]], none),
-        "PINHOLE" => ([p[0], p[1]], [p[2], p[3]], none),
-        "SIMPLE_RADIAL" => ([p[0], p[0]], [p[1], p[2]], Distortion { k1: d(3), ..none }),
-        "RADIAL" => (
-            [p[0], p[0]],
-            [p[1], p[2]],
-            Distortion {
-                k1: d(3),
-                k2: d(4),
-                ..none
-            },
-        ),
-        "OPENCV" => (
-            [p[0], p[1]],
-            [p[2], p[3]],
-            Distortion {
-                k1: d(4),
-                k2: d(5),
-                p1: d(6),
-                p2: d(7),
-                ..none
-            },
-        ),
-        "FULL_OPENCV" => {
-            let (tangential, below) = ((d(6), d(7)), [d(9), d(10), d(11)]);
-            (
-                [p[0], p[1]],
-                [p[2], p[3]],
-                Distortion {
-                    k1: d(4),
-                    k2: d(5),
-                    k3: d(8),
-                    p1: tangential.0,
-                    p2: tangential.1,
-                    radial_denominator: below,
-                    ..none
-                },
-            )
-        }
-        "OPENCV_FISHEYE" => (
-            [p[0], p[1]],
-            [p[2], p[3]],
-            Distortion {
-                projection: LensProjection::Fisheye,
-                k1: d(4),
-                k2: d(5),
-                k3: d(6),
-                k4: d(7),
-                ..none
-            },
-        ),
-        "SIMPLE_RADIAL_FISHEYE" => (
-            [p[0], p[0]],
-            [p[1], p[2]],
-            Distortion {
-                projection: LensProjection::Fisheye,
-                k1: d(3),
-                ..none
-            },
-        ),
-        "RADIAL_FISHEYE" => (
-            [p[0], p[0]],
-            [p[1], p[2]],
-            Distortion {
-                projection: LensProjection::Fisheye,
-                k1: d(3),
-                k2: d(4),
-                ..none
-            },
-        ),
-        "FOV" => (
-            [p[0], p[1]],
-            [p[2], p[3]],
-            if p[4] == 0.0 {
-                none
-            } else {
-                Distortion {
-                    projection: LensProjection::Fov(d(4)),
-                    ..none
-                }
-            },
-        ),
-        "THIN_PRISM_FISHEYE" => {
-            let radial = Distortion {
-                projection: LensProjection::Fisheye,
-                k1: d(4),
-                k2: d(5),
-                k3: d(8),
-                k4: d(9),
-                ..none
-            };
-            (
-                [p[0], p[1]],
-                [p[2], p[3]],
-                Distortion {
-                    p1: d(6),
-                    p2: d(7),
-                    prism: [d(10), d(11)],
-                    ..radial
-                },
-            )
-        }
-        other => {
-            return Err(Error::format(
-                path,
-                format!(
-                    "camera model {other} is not supported; undistort with 'colmap image_undistorter' first"
-                ),
-            ));
-        }
-    };
-    Ok(Lens {
-        width: width as u32,
-        height: height as u32,
-        focal,
-        centre,
-        distortion,
-    })
-}
-
 fn cameras_bin(path: &Path) -> Result<HashMap<u32, Lens>> {
     let data = fs::read(path)?;
     let mut bytes = ByteReader::new(path, &data);
@@ -300,11 +247,13 @@ fn cameras_bin(path: &Path) -> Result<HashMap<u32, Lens>> {
     for _ in 0..count {
         let (id, model) = (bytes.u32()?, bytes.u32()?);
         let (width, height) = (bytes.u64()?, bytes.u64()?);
-        let &(name, n) = MODELS
+        let model = MODELS
             .get(model as usize)
             .ok_or_else(|| Error::format(path, unknown(&format!("number {model}"))))?;
-        let parameters = (0..n).map(|_| bytes.f64()).collect::<Result<Vec<_>>>()?;
-        lenses.insert(id, lens(path, name, width, height, &parameters)?);
+        let parameters = (0..model.count())
+            .map(|_| bytes.f64())
+            .collect::<Result<Vec<_>>>()?;
+        lenses.insert(id, model.lens(width, height, &parameters));
     }
     Ok(lenses)
 }
@@ -376,7 +325,7 @@ fn rows(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
 
 /// Returns the error text for a camera model that is not supported.
 fn unknown(model: &str) -> String {
-    let known: Vec<&str> = MODELS.iter().map(|model| model.0).collect();
+    let known: Vec<&str> = MODELS.iter().map(|model| model.name).collect();
     format!(
         "the camera model {model} is not supported; undistort the photos with 'colmap image_undistorter' and use the model that it writes (supported: {})",
         known.join(", ")
@@ -398,18 +347,19 @@ fn parse<T: std::str::FromStr>(path: &Path, line: usize, fields: &[&str], i: usi
 fn cameras_txt(path: &Path) -> Result<HashMap<u32, Lens>> {
     let mut lenses = HashMap::new();
     for (line, f) in rows(&text(path)?).filter(|(_, f)| !f.is_empty()) {
-        let model = f.get(1).copied().unwrap_or_default();
-        let n = MODELS.iter().find(|m| m.0 == model).map(|m| m.1);
-        let n = n.ok_or_else(|| {
+        let name = f.get(1).copied().unwrap_or_default();
+        let model = MODELS.iter().find(|model| model.name == name);
+        let model = model.ok_or_else(|| {
             Error::format(
                 path,
-                format!("line {line}: {}", unknown(&format!("'{model}'"))),
+                format!("line {line}: {}", unknown(&format!("'{name}'"))),
             )
         })?;
+        let n = model.count();
         if f.len() != 4 + n {
             let given = f.len().saturating_sub(4);
             let why = format!(
-                "line {line}: the camera model {model} has {n} parameters, but this line has {given}; export the model again"
+                "line {line}: the camera model {name} has {n} parameters, but this line has {given}; export the model again"
             );
             return Err(Error::format(path, why));
         }
@@ -419,7 +369,7 @@ fn cameras_txt(path: &Path) -> Result<HashMap<u32, Lens>> {
         let (width, height) = (parse(path, line, &f, 2)?, parse(path, line, &f, 3)?);
         lenses.insert(
             parse(path, line, &f, 0)?,
-            lens(path, model, width, height, &parameters)?,
+            model.lens(width, height, &parameters),
         );
     }
     Ok(lenses)

@@ -206,105 +206,16 @@ pub fn load_model(photos: &Path, model: &Path) -> Result<Dataset> {
 }
 
 /// Names, sorts and checks the content of the pose files.
-fn assembled(photos: &Path, album: &Album, mut stated: ParsedPoses) -> Result<Dataset> {
+fn assembled(photos: &Path, album: &Album, stated: ParsedPoses) -> Result<Dataset> {
     if stated.photos.is_empty() {
-        let why = stated
-            .warnings
-            .iter()
-            .map(|warning| format!("; {warning}"))
-            .collect::<String>();
+        let warnings = stated.warnings.iter().map(|warning| format!("; {warning}"));
         return Err(Error::Invalid(format!(
-            "{}: no photo has a pose{why}",
-            photos.display()
+            "{}: no photo has a pose{}",
+            photos.display(),
+            warnings.collect::<String>()
         )));
     }
-    let files: Vec<&Path> = stated
-        .photos
-        .iter()
-        .map(|photo| photo.path.as_path())
-        .collect();
-    let names = album.view_names(&files);
-    let held_out = files
-        .iter()
-        .zip(&names)
-        .filter(|(file, _)| stated.held_out.iter().any(|held| held == *file))
-        .map(|f| f.1.clone());
-    let held_out = held_out.collect();
-    stated
-        .photos
-        .iter_mut()
-        .zip(names)
-        .for_each(|(photo, name)| photo.camera.name = name);
-    let mut order: Vec<usize> = (0..stated.photos.len()).collect();
-    order.sort_by(|a, b| {
-        stated.photos[*a]
-            .camera
-            .name
-            .cmp(&stated.photos[*b].camera.name)
-    });
-    let mut new_index = vec![0; order.len()];
-    order
-        .iter()
-        .enumerate()
-        .for_each(|(new, old)| new_index[*old] = new as u32);
-    let renumbered = |photos: &Vec<u32>| {
-        photos
-            .iter()
-            .map(|photo| new_index[*photo as usize])
-            .collect()
-    };
-    let mut dataset = Dataset {
-        track_photos: stated.track_photos.iter().map(renumbered).collect(),
-        photos: order
-            .into_iter()
-            .map(|old| stated.photos[old].clone())
-            .collect(),
-        conventions: stated.conventions,
-        held_out,
-        warnings: stated.warnings,
-        ..Dataset::default()
-    };
-    if let Some(pair) = dataset
-        .photos
-        .windows(2)
-        .find(|p| p[0].camera.name == p[1].camera.name)
-    {
-        return Err(Error::format(
-            photos,
-            format!(
-                "the photo '{}' has two poses; remove one of them",
-                pair[0].camera.name
-            ),
-        ));
-    }
-    let finite: Vec<bool> = stated
-        .points
-        .iter()
-        .map(|(position, _)| position.is_finite())
-        .collect();
-    let lost = finite.iter().filter(|finite| !**finite).count();
-    if lost > 0 {
-        dataset.warnings.push(format!(
-            "{lost} of {} points have NaN or infinite positions and are ignored",
-            finite.len()
-        ));
-    }
-    let mut keep = finite.iter();
-    dataset
-        .track_photos
-        .retain(|_| *keep.next().unwrap_or(&true));
-    for (position, color) in stated
-        .points
-        .into_iter()
-        .filter(|(position, _)| position.is_finite())
-    {
-        dataset.world_points.push(position);
-        dataset.points.push(SfmPoint {
-            position: Vec3::ZERO,
-            color,
-            seen_by: Vec::new(),
-        });
-    }
+    let mut dataset = named_and_sorted(photos, album, stated)?;
     dataset.apply_convention(dataset.conventions[0]);
     for photo in &mut dataset.photos {
         photo
@@ -320,6 +231,71 @@ fn assembled(photos: &Path, album: &Album, mut stated: ParsedPoses) -> Result<Da
     dataset
         .warnings
         .extend(images_folder(photos).and_then(|images| unreadable_images_warning(&images)));
+    Ok(dataset)
+}
+
+/// Returns the content of the pose files with view names, sorted by them.
+fn named_and_sorted(photos: &Path, album: &Album, mut stated: ParsedPoses) -> Result<Dataset> {
+    let files: Vec<&Path> = stated.photos.iter().map(|p| p.path.as_path()).collect();
+    let names = album.view_names(&files);
+    let held_out = files
+        .iter()
+        .zip(&names)
+        .filter(|(file, _)| stated.held_out.iter().any(|held| held == *file))
+        .map(|(_, name)| name.clone())
+        .collect();
+    for (photo, name) in stated.photos.iter_mut().zip(names) {
+        photo.camera.name = name;
+    }
+    let name_of = |index: &usize| &stated.photos[*index].camera.name;
+    let mut order: Vec<usize> = (0..stated.photos.len()).collect();
+    order.sort_by(|a, b| name_of(a).cmp(name_of(b)));
+    if let Some(pair) = order.windows(2).find(|p| name_of(&p[0]) == name_of(&p[1])) {
+        let name = name_of(&pair[0]);
+        let reason = format!("the photo '{name}' has two poses; remove one of them");
+        return Err(Error::format(photos, reason));
+    }
+    let mut new_index = vec![0; order.len()];
+    for (new, old) in order.iter().enumerate() {
+        new_index[*old] = new as u32;
+    }
+    let mut dataset = Dataset {
+        photos: order
+            .iter()
+            .map(|old| stated.photos[*old].clone())
+            .collect(),
+        conventions: stated.conventions,
+        held_out,
+        warnings: stated.warnings,
+        ..Dataset::default()
+    };
+    let count = stated.points.len();
+    let mut tracks = stated.track_photos.into_iter();
+    for (position, color) in stated.points {
+        let track = tracks.next();
+        if !position.is_finite() {
+            continue;
+        }
+        let renumbered = |track: Vec<u32>| {
+            track
+                .iter()
+                .map(|photo| new_index[*photo as usize])
+                .collect()
+        };
+        dataset.track_photos.extend(track.map(renumbered));
+        dataset.world_points.push(position);
+        dataset.points.push(SfmPoint {
+            position: Vec3::ZERO,
+            color,
+            seen_by: Vec::new(),
+        });
+    }
+    let lost = count - dataset.points.len();
+    if lost > 0 {
+        dataset.warnings.push(format!(
+            "{lost} of {count} points have NaN or infinite positions and are ignored"
+        ));
+    }
     Ok(dataset)
 }
 

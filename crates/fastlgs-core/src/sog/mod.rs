@@ -158,37 +158,8 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
     let sh0 = picture("sh0.webp", &|i| {
         with_alpha(color(i), byte(sigmoid(scene.opacity_logits[i])))
     });
-    let bands = scene.sh_degree;
-    let mut centroids = None;
-    let rest = (bands > 0).then(|| {
-        let rows: Vec<f32> = scene.sh_rest.iter().flat_map(|v| v.to_array()).collect();
-        let palette = palette(&rows, 3 * rest_len(bands));
-        let labels = picture("shN_labels.webp", &|i| {
-            let [low, high] = palette.labels[i].to_le_bytes();
-            [low, high, 0, 255]
-        });
-        let codes = codebook(palette.rows.iter().copied());
-        let coded = palette
-            .rows
-            .chunks_exact(3)
-            .map(|v| with_alpha([0, 1, 2].map(|k| nearest(&codes, v[k])), 255));
-        let width = PALETTE_COLUMNS * rest_len(bands);
-        let mut coded: Vec<[u8; 4]> = coded.collect();
-        let count = coded.len() / rest_len(bands);
-        coded.resize(coded.len().next_multiple_of(width), [0, 0, 0, 255]);
-        let name = "shN_centroids.webp";
-        centroids = Some(Picture {
-            name,
-            width,
-            pixels: coded,
-        });
-        Rest {
-            count,
-            bands,
-            codebook: codes.to_vec(),
-            files: [name.to_owned(), labels],
-        }
-    });
+    let rest = (scene.sh_degree > 0).then(|| coded_rest(scene, &mut picture));
+    let (rest, centroids) = rest.unzip();
     pictures.extend(centroids);
     let meta = Meta {
         version: VERSION,
@@ -213,6 +184,43 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
         rest,
     };
     archive(path, &meta, &pictures)
+}
+
+/// Codes the SH coefficients above degree 0 by a palette. `picture` stores an image of one pixel for
+/// each Gaussian, and returns its name. The palette itself is returned as an image.
+fn coded_rest(
+    scene: &Gaussians,
+    picture: &mut impl FnMut(&'static str, &dyn Fn(usize) -> [u8; 4]) -> String,
+) -> (Rest, Picture) {
+    let bands = scene.sh_degree;
+    let rows: Vec<f32> = scene.sh_rest.iter().flat_map(|v| v.to_array()).collect();
+    let palette = palette(&rows, 3 * rest_len(bands));
+    let labels = picture("shN_labels.webp", &|i| {
+        let [low, high] = palette.labels[i].to_le_bytes();
+        [low, high, 0, 255]
+    });
+    let codes = codebook(palette.rows.iter().copied());
+    let coded = palette
+        .rows
+        .chunks_exact(3)
+        .map(|v| with_alpha([0, 1, 2].map(|k| nearest(&codes, v[k])), 255));
+    let width = PALETTE_COLUMNS * rest_len(bands);
+    let mut pixels: Vec<[u8; 4]> = coded.collect();
+    let count = pixels.len() / rest_len(bands);
+    pixels.resize(pixels.len().next_multiple_of(width), [0, 0, 0, 255]);
+    let name = "shN_centroids.webp";
+    let rest = Rest {
+        count,
+        bands,
+        codebook: codes.to_vec(),
+        files: [name.to_owned(), labels],
+    };
+    let centroids = Picture {
+        name,
+        width,
+        pixels,
+    };
+    (rest, centroids)
 }
 
 fn with_alpha([r, g, b]: [u8; 3], a: u8) -> [u8; 4] {
@@ -286,25 +294,102 @@ fn rotation([a, b, c, tag]: [u8; 4]) -> Option<[f32; 4]> {
     out.try_into().ok()
 }
 
+/// An opened SOG file.
+struct Archive<'a> {
+    path: &'a Path,
+    zip: ZipArchive<Cursor<Vec<u8>>>,
+}
+
+impl Archive<'_> {
+    fn bad(&self, reason: String) -> Error {
+        Error::format(self.path, reason)
+    }
+
+    /// Returns the content of a member.
+    fn member(&mut self, name: &str) -> Result<Vec<u8>> {
+        let path = self.path;
+        let bad = |reason: String| Error::format(path, reason);
+        let mut data = Vec::new();
+        let mut file = self
+            .zip
+            .by_name(name)
+            .map_err(|e| bad(format!("it does not contain {name} ({e}); export it again")))?;
+        file.read_to_end(&mut data)
+            .map_err(|e| bad(format!("{name} is damaged ({e}); copy it again")))?;
+        Ok(data)
+    }
+
+    /// Returns the first `count` pixels of a picture.
+    fn pixels(&mut self, name: &str, count: usize) -> Result<Vec<[u8; 4]>> {
+        let data = self.member(name)?;
+        let damaged =
+            |e: image::ImageError| self.bad(format!("{name} is damaged ({e}); copy it again"));
+        let decoder = WebPDecoder::new(Cursor::new(data)).map_err(damaged)?;
+        let channels = usize::from(decoder.color_type().channel_count());
+        let (width, height) = decoder.dimensions();
+        // Check the size before allocating memory for it.
+        if (width as usize) * (height as usize) < count {
+            return Err(self.bad(format!(
+                "{name} has {width}x{height} pixels, but at least {count} are needed; export it again"
+            )));
+        }
+        let mut values = vec![0; decoder.total_bytes() as usize];
+        decoder.read_image(&mut values).map_err(damaged)?;
+        let pixel = |p: &[u8]| [p[0], p[1], p[2], if channels == 4 { p[3] } else { 255 }];
+        Ok(values
+            .chunks_exact(channels)
+            .take(count)
+            .map(pixel)
+            .collect())
+    }
+
+    /// Returns a function that looks up the first three bytes of a pixel in a codebook.
+    fn lookup(&self, codes: &[f32], name: &str) -> Result<impl Fn([u8; 4]) -> Vec3 + use<>> {
+        let codes = <[f32; CODES]>::try_from(codes).map_err(|_| {
+            self.bad(format!(
+                "the codebook of {name} does not have {CODES} numbers; export it again"
+            ))
+        })?;
+        Ok(move |p: [u8; 4]| Vec3::from_array([p[0], p[1], p[2]].map(|v| codes[usize::from(v)])))
+    }
+
+    /// Returns the SH coefficients above degree 0 of `count` Gaussians.
+    fn rest(&mut self, rest: &Rest, count: usize) -> Result<Vec<Vec3>> {
+        if rest.bands > MAX_SH_DEGREE {
+            return Err(self.bad(format!(
+                "SH degree {} is not supported; export it with degree {MAX_SH_DEGREE} or less",
+                rest.bands
+            )));
+        }
+        let width = rest_len(rest.bands);
+        let centroids = self.pixels(&rest.files[0], rest.count * width)?;
+        let labels = self.pixels(&rest.files[1], count)?;
+        let value = self.lookup(&rest.codebook, "shN")?;
+        let mut coefficients = Vec::with_capacity(count * width);
+        for label in &labels {
+            let at = usize::from(u16::from_le_bytes([label[0], label[1]])) * width;
+            let row = centroids.get(at..at + width).ok_or_else(|| {
+                self.bad(format!(
+                    "{} refers to rows that the palette does not have; export it again",
+                    rest.files[1]
+                ))
+            })?;
+            coefficients.extend(row.iter().map(|p| value(*p)));
+        }
+        Ok(coefficients)
+    }
+}
+
 /// Reads a scene. Features are zero and object ids 0.
 ///
 /// # Errors
 /// [`Error::Format`] for other content, truncated files and other versions.
 pub fn read(path: &Path) -> Result<Gaussians> {
     let bad = |reason: String| Error::format(path, reason);
-    let data = fs::read(path)?;
-    let mut archive = ZipArchive::new(Cursor::new(data))
+    let zip = ZipArchive::new(Cursor::new(fs::read(path)?))
         .map_err(|e| bad(format!("not a complete SOG file ({e}); copy it again")))?;
-    let mut member = |name: &str| -> Result<Vec<u8>> {
-        let mut data = Vec::new();
-        let mut file = archive
-            .by_name(name)
-            .map_err(|e| bad(format!("it does not contain {name} ({e}); export it again")))?;
-        file.read_to_end(&mut data)
-            .map_err(|e| bad(format!("{name} is damaged ({e}); copy it again")))?;
-        Ok(data)
-    };
-    let meta: Meta = serde_json::from_slice(&member("meta.json")?)
+    let mut archive = Archive { path, zip };
+    let meta: Meta = serde_json::from_slice(&archive.member("meta.json")?)
         .map_err(|e| bad(format!("meta.json: {e}")))?;
     if meta.version != VERSION {
         return Err(bad(format!(
@@ -313,107 +398,42 @@ pub fn read(path: &Path) -> Result<Gaussians> {
         )));
     }
     let n = meta.count;
-    let mut picture = |name: &str, least: usize| -> Result<Vec<[u8; 4]>> {
-        let data = member(name)?;
-        let damaged = |e: image::ImageError| bad(format!("{name} is damaged ({e}); copy it again"));
-        let decoder = WebPDecoder::new(Cursor::new(data)).map_err(damaged)?;
-        let channels = usize::from(decoder.color_type().channel_count());
-        let (width, height) = decoder.dimensions();
-        // Check the size before allocating memory for it.
-        if (width as usize) * (height as usize) < least {
-            return Err(bad(format!(
-                "{name} has {width}x{height} pixels, too few for {n} Gaussians"
-            )));
-        }
-        let mut values = vec![0; decoder.total_bytes() as usize];
-        decoder.read_image(&mut values).map_err(damaged)?;
-        let pixel = |p: &[u8]| [p[0], p[1], p[2], if channels == 4 { p[3] } else { 255 }];
-        Ok(values.chunks_exact(channels).map(pixel).collect())
-    };
-    let of = |codes: &[f32], name: &str| {
-        <[f32; CODES]>::try_from(codes).map_err(|_| {
-            bad(format!(
-                "the codebook of {name} does not have {CODES} numbers; export it again"
-            ))
-        })
-    };
-    let lookup = |codes: [f32; CODES]| {
-        move |p: [u8; 4]| Vec3::from_array([p[0], p[1], p[2]].map(|v| codes[usize::from(v)]))
-    };
-
-    let low = picture(&meta.means.files[0], n)?;
-    let high = picture(&meta.means.files[1], n)?;
+    let low = archive.pixels(&meta.means.files[0], n)?;
+    let high = archive.pixels(&meta.means.files[1], n)?;
     let (from, to) = (Vec3::from(meta.means.mins), Vec3::from(meta.means.maxs));
     let mean = |(l, u): (&[u8; 4], &[u8; 4])| {
         let steps =
             Vec3::from_array([0, 1, 2].map(|k| f32::from(u16::from_le_bytes([l[k], u[k]]))));
         signed_exp(from + (to - from) * steps / 65535.0)
     };
-    let means = low.iter().zip(&high).take(n).map(mean).collect();
-    let rotations = picture(&meta.quats.files[0], n)?
-        .into_iter()
-        .take(n)
-        .map(rotation)
-        .collect::<Option<Vec<_>>>();
+    let rotations = archive.pixels(&meta.quats.files[0], n)?;
+    let rotations = rotations.into_iter().map(rotation).collect::<Option<_>>();
     let rotations = rotations.ok_or_else(|| {
         bad(format!(
             "{} has pixels that are not rotations; export it again",
             meta.quats.files[0]
         ))
     })?;
-    let scale = lookup(of(&meta.scales.codebook, "scales")?);
-    let log_scales = picture(&meta.scales.files[0], n)?
-        .into_iter()
-        .take(n)
-        .map(scale)
-        .collect();
-    let colors = picture(&meta.sh0.files[0], n)?;
+    let scale = archive.lookup(&meta.scales.codebook, "scales")?;
+    let scales = archive.pixels(&meta.scales.files[0], n)?;
+    let color = archive.lookup(&meta.sh0.codebook, "sh0")?;
+    let colors = archive.pixels(&meta.sh0.files[0], n)?;
     // Opacities of exactly 0 and 1 have no finite logit.
-    let opacity_logits = colors
-        .iter()
-        .take(n)
-        .map(|p| logit((f32::from(p[3]) / 255.0).clamp(0.001, 0.999)))
-        .collect();
-    let sh_dc = colors
-        .into_iter()
-        .take(n)
-        .map(lookup(of(&meta.sh0.codebook, "sh0")?))
-        .collect();
-    let mut sh_rest = Vec::new();
-    let mut sh_degree = 0;
-    if let Some(rest) = &meta.rest {
-        sh_degree = rest.bands;
-        if sh_degree > MAX_SH_DEGREE {
-            return Err(bad(format!(
-                "SH degree {sh_degree} is not supported; export it with degree {MAX_SH_DEGREE} or less"
-            )));
-        }
-        let width = rest_len(sh_degree);
-        let centroids = picture(&rest.files[0], rest.count * width)?;
-        let labels = picture(&rest.files[1], n)?;
-        let value = lookup(of(&rest.codebook, "shN")?);
-        for label in labels.iter().take(n) {
-            let at = usize::from(u16::from_le_bytes([label[0], label[1]])) * width;
-            let row = centroids.get(at..at + width).ok_or_else(|| {
-                bad(format!(
-                    "{} refers to rows that the palette does not have; export it again",
-                    rest.files[1]
-                ))
-            })?;
-            sh_rest.extend(row.iter().map(|p| value(*p)));
-        }
-    }
-    let (features, object_ids) = (vec![Vec3::ZERO; n], vec![0; n]);
+    let opacity_logit = |p: &[u8; 4]| logit((f32::from(p[3]) / 255.0).clamp(0.001, 0.999));
+    let (sh_degree, sh_rest) = match &meta.rest {
+        Some(rest) => (rest.bands, archive.rest(rest, n)?),
+        None => (0, Vec::new()),
+    };
     Ok(Gaussians {
-        means,
-        log_scales,
+        means: low.iter().zip(&high).map(mean).collect(),
+        log_scales: scales.into_iter().map(scale).collect(),
         rotations,
-        opacity_logits,
-        sh_dc,
+        opacity_logits: colors.iter().map(opacity_logit).collect(),
+        sh_dc: colors.into_iter().map(color).collect(),
         sh_degree,
         sh_rest,
-        features,
-        object_ids,
+        features: vec![Vec3::ZERO; n],
+        object_ids: vec![0; n],
     })
 }
 

@@ -97,13 +97,7 @@ pub fn blend(
         .collect();
     for (pixel_index, values) in tiles.into_iter().flatten() {
         for (c, value) in values.into_iter().enumerate() {
-            if c >= 6
-                || if c < 3 {
-                    channels.color()
-                } else {
-                    channels.feature()
-                }
-            {
+            if c >= 6 || channels.includes(c) {
                 frame[c * n + pixel_index] = value;
             }
         }

@@ -97,22 +97,7 @@ pub(crate) fn backward_one(
         return None;
     }
     let mean = param3(0);
-    // Section 5.6. Colour is clamped at 0 from below.
-    let positive = Vec3::new(splat[1][2], splat[1][3], splat[2][0]).cmpgt(Vec3::ZERO);
-    let d_color = Vec3::select(positive, Vec3::new(slot[6], slot[7], slot[8]), Vec3::ZERO);
-    put3(11, SH_C0 * d_color);
-    let mut d_mean_by_color = Vec3::ZERO;
-    if view.sh_degree > 0 {
-        let ray = mean - Vec3::from_slice(&view.camera);
-        let (distance, direction) = (ray.length(), ray.normalize());
-        let (y, slopes) = (basis(direction), basis_slopes(direction));
-        let mut d_direction = Vec3::ZERO;
-        for k in 0..rest_len(view.sh_degree) {
-            put3(BASE_CHANNELS + 3 * k, y[k] * d_color);
-            d_direction += param3(BASE_CHANNELS + 3 * k).dot(d_color) * slopes[k];
-        }
-        d_mean_by_color = (d_direction - direction * direction.dot(d_direction)) / distance;
-    }
+    let d_mean_by_color = color_gradient(view, param3, splat, slot, put3);
 
     // Section 5.3: the conic Q of the natural exponent, from the splat's base-2 exponent.
     let ln2 = std::f32::consts::LN_2;
@@ -149,7 +134,6 @@ pub(crate) fn backward_one(
     let clamped = view.kept_gain() * opacity * covariance::compensation(dets, view) >= ALPHA_MAX;
     let unclamped_opacity = if clamped && slot[5] < 0.0 { 0.0 } else { 1.0 };
     put(10, slot[5] * (1.0 - opacity) * unclamped_opacity);
-    let mut put3 = |c: usize, v: Vec3| (0..3).for_each(|k| put(c + k, v[k]));
     if view.antialias == 1 && covariance::determinant_share(dets) > 1e-6 {
         // d log(compensation) / d cov = (inverse before dilation - inverse after it) / 2.
         let (xx, yy) = (cov.x - DILATION, cov.z - DILATION);
@@ -165,16 +149,55 @@ pub(crate) fn backward_one(
         2.0 * (d_cov_xy * a_x + d_cov_yy * a_y),
     );
     let d_m = [0, 1, 2].map(|k| jw_x * d_a_x[k] + jw_y * d_a_y[k]);
-    put3(
-        3,
-        s * Vec3::new(
-            r.col(0).dot(d_m[0]),
-            r.col(1).dot(d_m[1]),
-            r.col(2).dot(d_m[2]),
-        ),
+    let d_scale = Vec3::new(
+        r.col(0).dot(d_m[0]),
+        r.col(1).dot(d_m[1]),
+        r.col(2).dot(d_m[2]),
     );
+    let d_rotation = rotation_gradient(q, [d_m[0] * s.x, d_m[1] * s.y, d_m[2] * s.z]);
 
-    let [d_r0, d_r1, d_r2] = [d_m[0] * s.x, d_m[1] * s.y, d_m[2] * s.z];
+    // Section 5.5: the mean, through the projected centre and through J.
+    let m = [r.col(0) * s.x, r.col(1) * s.y, r.col(2) * s.z];
+    let d_jw = [d_a_x, d_a_y].map(|d_a| m[0] * d_a.x + m[1] * d_a.y + m[2] * d_a.z);
+    let world = covariance::world_to_camera_rotation(view);
+    let d_t = camera_gradient(view, t, d_center, d_jw.map(|d_jw| world * d_jw));
+    let mut put3 = |c: usize, v: Vec3| (0..3).for_each(|k| put(c + k, v[k]));
+    put3(3, s * d_scale);
+    put3(0, world.transpose() * d_t + d_mean_by_color);
+    (0..4).for_each(|k| put(6 + k, d_rotation[k]));
+    Some((d_center * 0.5 * size).length())
+}
+
+/// Section 5.6: puts the gradients of the SH coefficients. Returns the gradient of the mean through
+/// the viewing direction. Colour is clamped at 0 from below.
+#[inline(always)]
+fn color_gradient(
+    view: &View,
+    param3: impl Fn(usize) -> Vec3,
+    splat: &Splat,
+    slot: &[f32; 12],
+    mut put3: impl FnMut(usize, Vec3),
+) -> Vec3 {
+    let positive = Vec3::new(splat[1][2], splat[1][3], splat[2][0]).cmpgt(Vec3::ZERO);
+    let d_color = Vec3::select(positive, Vec3::new(slot[6], slot[7], slot[8]), Vec3::ZERO);
+    put3(11, SH_C0 * d_color);
+    if view.sh_degree == 0 {
+        return Vec3::ZERO;
+    }
+    let ray = param3(0) - Vec3::from_slice(&view.camera);
+    let (distance, direction) = (ray.length(), ray.normalize());
+    let (y, slopes) = (basis(direction), basis_slopes(direction));
+    let mut d_direction = Vec3::ZERO;
+    for k in 0..rest_len(view.sh_degree) {
+        put3(BASE_CHANNELS + 3 * k, y[k] * d_color);
+        d_direction += param3(BASE_CHANNELS + 3 * k).dot(d_color) * slopes[k];
+    }
+    (d_direction - direction * direction.dot(d_direction)) / distance
+}
+
+/// Returns the gradient of the quaternion `q` from those of the columns of its rotation matrix.
+#[inline(always)]
+fn rotation_gradient(q: [f32; 4], [d_r0, d_r1, d_r2]: [Vec3; 3]) -> Vec4 {
     let length = Vec4::from(q).length().max(1e-12);
     let unit = Vec4::from(q) / length;
     let (w, x, y, z) = (unit.x, unit.y, unit.z, unit.w);
@@ -188,14 +211,13 @@ pub(crate) fn backward_one(
             x * (d_r0.z + d_r2.x) + y * (d_r1.z + d_r2.y) + w * (d_r0.y - d_r1.x)
                 - 2.0 * z * (d_r0.x + d_r1.y),
         );
-    let d_rotation = (d_unit - unit * unit.dot(d_unit)) / length;
+    (d_unit - unit * unit.dot(d_unit)) / length
+}
 
-    let m = [r.col(0) * s.x, r.col(1) * s.y, r.col(2) * s.z];
-    // Section 5.5: the mean, through the projected centre and through J.
-    let d_jw_x = m[0] * d_a_x.x + m[1] * d_a_x.y + m[2] * d_a_x.z;
-    let d_jw_y = m[0] * d_a_y.x + m[1] * d_a_y.y + m[2] * d_a_y.z;
-    let world = covariance::world_to_camera_rotation(view);
-    let (d_j_x, d_j_y) = (world * d_jw_x, world * d_jw_y);
+/// Section 5.5: returns the gradient of the mean in camera coordinates `t`, from those of the
+/// projected centre and of the rows of J.
+#[inline(always)]
+fn camera_gradient(view: &View, t: Vec3, d_center: Vec2, [d_j_x, d_j_y]: [Vec3; 2]) -> Vec3 {
     let (inverse_z, focal) = (1.0 / t.z, Vec2::from(view.focal));
     let slope = covariance::clamped_slope(t, view);
     let unclamped = Vec2::select(slope.cmpeq(t.truncate() / t.z), Vec2::ONE, Vec2::ZERO);
@@ -207,7 +229,5 @@ pub(crate) fn backward_one(
     let d_rows = Vec2::new(d_j_x.x - slope.x * d_j_x.z, d_j_y.y - slope.y * d_j_y.z);
     d_t.z -= inverse_z * inverse_z * focal.dot(d_rows)
         + inverse_z * inverse_z * d_slope.dot(t.truncate());
-    put3(0, world.transpose() * d_t + d_mean_by_color);
-    (0..4).for_each(|k| put(6 + k, d_rotation[k]));
-    Some((d_center * 0.5 * size).length())
+    d_t
 }

@@ -2,227 +2,125 @@
 
 use super::*;
 use crate::channels::Channels;
-use crate::view::Planes;
-use bytemuck::{Pod, cast_slice as read, cast_slice_mut as write};
+use crate::view::{ChunkJob, Planes, Step, View};
+use bytemuck::{Pod, cast_slice, cast_slice_mut};
+
+/// Calls a twin with its first arguments and its buffers. A buffer is `words` (u32), or `read` or
+/// `write` (another type, for reading or writing).
+macro_rules! call {
+    ($twin:ident($($first:expr),*), $buffers:ident, [$($buffer:ident: $access:ident),*]) => {{
+        let [$($buffer),*] = $buffers else {
+            panic!("{} with {} buffers", stringify!($twin), $buffers.len())
+        };
+        $twin($($first,)* $(call!(@$access $buffer)),*)
+    }};
+    (@words $buffer:ident) => { $buffer };
+    (@read $buffer:ident) => { cast_slice($buffer) };
+    (@write $buffer:ident) => { cast_slice_mut($buffer) };
+}
 
 /// Runs the twin of the pass `name` on its uniform and its storage buffers. `buffers` is in the
 /// order of the bindings.
 ///
 /// # Panics
-/// If there is no such pass, or a buffer is too small.
+/// If there is no such pass, or a buffer is missing or too small.
 pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut [Vec<u32>]) {
-    let view = || uniform_of::<crate::View>(uniform);
-    let job = || uniform_of::<crate::view::ChunkJob>(uniform);
-    match (name, buffers) {
-        ("project", [params, splats, depths, footprints, touched]) => {
-            project(
-                &view(),
-                read(params),
-                write(splats),
-                depths,
-                write(footprints),
-                touched,
-            );
+    let b = buffers;
+    match name {
+        "radix_count" => call!(radix_count(&job(uniform)), b, [keys: words, histogram: words]),
+        "radix_scatter" => call!(radix_scatter(&job(uniform)), b,
+            [keys: words, values: words, histogram: words, keys_out: words, values_out: words]),
+        "scan_chunks" => call!(scan_chunks(&job(uniform)), b, [items: words, totals: words]),
+        "scan_apply" => call!(scan_apply(&job(uniform)), b, [items: words, totals: words]),
+        "adam" => call!(adam(&of::<Step>(uniform)), b,
+            [gradients: read, params: write, moment1: write, moment2: write]),
+        "ssim_rows" | "ssim_columns" | "ssim_backward_rows" | "loss_gradient" => {
+            run_loss(name, &of(uniform), b);
         }
-        ("radix_count", [keys, histogram]) => radix_count(&job(), keys, histogram),
-        ("radix_scatter", [keys, values, histogram, keys_out, values_out]) => {
-            radix_scatter(&job(), keys, values, histogram, keys_out, values_out);
-        }
-        ("scan_chunks", [items, totals]) => scan_chunks(&job(), items, totals),
-        ("scan_apply", [items, totals]) => scan_apply(&job(), items, totals),
-        ("gather_counts", [order, touched, offsets]) => {
-            gather_counts(&view(), order, touched, offsets)
-        }
-        ("emit", [order, offsets, footprints, touched, tiles, gaussians, first]) => {
-            emit(
-                &view(),
-                order,
-                offsets,
-                read(footprints),
-                touched,
-                tiles,
-                gaussians,
-                first,
-            );
-        }
-        ("tile_ranges", [tiles, ranges]) => tile_ranges(&view(), tiles, ranges),
-        ("tile_load", [ranges, keys]) => tile_load(&view(), ranges, keys),
-        ("blend", [ranges, order, sorted, gaussians, splats, frame]) => {
-            let order = &order[..view().tile_count() as usize];
-            blend(
-                &view(),
-                channels,
-                ranges,
-                order,
-                sorted,
-                gaussians,
-                read(splats),
-                write(frame),
-            );
-        }
-        ("blend_ids", [ranges, sorted, gaussians, splats, ids, shares]) => {
-            blend_ids(
-                &view(),
-                ranges,
-                sorted,
-                gaussians,
-                read(splats),
-                ids,
-                shares,
-            );
-        }
-        ("blend_votes", [ranges, sorted, gaussians, splats, labels, tile_votes, votes]) => {
-            blend_votes(
-                &view(),
-                ranges,
-                sorted,
-                gaussians,
-                read(splats),
-                labels,
-                tile_votes,
-                write(votes),
-            );
-        }
-        ("blend_saliency", [ranges, sorted, gaussians, splats, frame, factors, saliency]) => {
-            blend_saliency(
-                &view(),
-                ranges,
-                sorted,
-                gaussians,
-                read(splats),
-                read(frame),
-                read(factors),
-                write(saliency),
-            );
-        }
-        ("ssim_rows", [frame, targets, rows]) => {
-            each_plane(&uniform_of(uniform), rows, &mut [], |plane, rows, _| {
-                ssim_rows(plane, read(frame), targets, write(rows))
-            });
-        }
-        ("ssim_columns", [rows, partials, sums]) => {
-            each_plane(
-                &uniform_of(uniform),
-                rows,
-                partials,
-                |plane, rows, partials| {
-                    ssim_columns(plane, read(rows), write(partials), write(sums))
-                },
-            );
-        }
-        ("ssim_backward_rows", [partials, rows]) => {
-            each_plane(
-                &uniform_of(uniform),
-                rows,
-                partials,
-                |plane, rows, partials| ssim_backward_rows(plane, read(partials), write(rows)),
-            );
-        }
-        ("loss_gradient", [frame, targets, rows, gradient, sums]) => {
-            let mut twin = |plane: &Plane, rows: &mut [u32]| {
-                loss_gradient(
-                    plane,
-                    read(frame),
-                    targets,
-                    read(rows),
-                    write(gradient),
-                    write(sums),
-                )
-            };
-            each_plane(&uniform_of(uniform), rows, &mut [], |plane, rows, _| {
-                twin(plane, rows)
-            });
-        }
-        ("fold_slots", [touched, first, gaussians, slots]) => {
-            fold_slots(&view(), channels, touched, first, gaussians, write(slots))
-        }
-        (
-            "blend_backward",
-            [
-                ranges,
-                order,
-                sorted,
-                gaussians,
-                splats,
-                frame,
-                gradient,
-                slots,
-            ],
-        ) => {
-            let order = &order[..view().tile_count() as usize];
-            let (frame, gradient) = (read(frame), read(gradient));
-            blend_backward(
-                &view(),
-                channels,
-                ranges,
-                order,
-                sorted,
-                gaussians,
-                read(splats),
-                frame,
-                gradient,
-                write(slots),
-            );
-        }
-        (
-            "project_backward",
-            [
-                params,
-                splats,
-                order,
-                touched,
-                first,
-                slots,
-                gradients,
-                stats,
-            ],
-        ) => {
-            let (params, slots) = (read(params), read(slots));
-            project_backward(
-                &view(),
-                channels,
-                params,
-                read(splats),
-                order,
-                touched,
-                first,
-                slots,
-                write(gradients),
-                write(stats),
-            );
-        }
-        ("adam", [gradients, params, moment1, moment2]) => {
-            adam(
-                &uniform_of(uniform),
-                read(gradients),
-                write(params),
-                write(moment1),
-                write(moment2),
-            );
-        }
-        (name, buffers) => panic!("no CPU twin '{name}' with {} buffers", buffers.len()),
+        _ => run_frame(name, channels, &of(uniform), b),
     }
 }
 
-fn uniform_of<T: Pod>(bytes: &[u8]) -> T {
-    bytemuck::pod_read_unaligned(&bytes[..size_of::<T>()])
+/// Runs a twin that renders a view, or computes its gradients.
+fn run_frame(name: &str, channels: Channels, view: &View, b: &mut [Vec<u32>]) {
+    match name {
+        "project" => call!(project(view), b,
+            [params: read, splats: write, depths: words, footprints: write, touched: words]),
+        "gather_counts" => call!(gather_counts(view), b,
+            [order: words, touched: words, offsets: words]),
+        "emit" => call!(emit(view), b, [order: words, offsets: words, footprints: read,
+            touched: words, tiles: words, gaussians: words, first: words]),
+        "tile_ranges" => call!(tile_ranges(view), b, [tiles: words, ranges: words]),
+        "tile_load" => call!(tile_load(view), b, [ranges: words, keys: words]),
+        "blend" => {
+            // The buffer of the sorted tiles may be longer than the frame needs.
+            b[1].truncate(view.tile_count() as usize);
+            call!(blend(view, channels), b, [ranges: words, order: words, sorted: words,
+                gaussians: words, splats: read, frame: write]);
+        }
+        "blend_ids" => call!(blend_ids(view), b, [ranges: words, sorted: words, gaussians: words,
+            splats: read, ids: words, shares: words]),
+        "blend_votes" => call!(blend_votes(view), b, [ranges: words, sorted: words,
+            gaussians: words, splats: read, labels: words, tile_votes: words, votes: write]),
+        "blend_saliency" => call!(blend_saliency(view), b, [ranges: words, sorted: words,
+            gaussians: words, splats: read, frame: read, factors: read, saliency: write]),
+        "blend_backward" => {
+            b[1].truncate(view.tile_count() as usize);
+            call!(blend_backward(view, channels), b, [ranges: words, order: words, sorted: words,
+                gaussians: words, splats: read, frame: read, gradient: read, slots: write]);
+        }
+        "fold_slots" => call!(fold_slots(view, channels), b,
+            [touched: words, first: words, gaussians: words, slots: write]),
+        "project_backward" => call!(project_backward(view, channels), b, [params: read,
+            splats: read, order: words, touched: words, first: words, slots: read,
+            gradients: write, stats: write]),
+        name => panic!("there is no CPU twin '{name}'"),
+    }
 }
 
-/// Runs a twin on each plane with the plane's own maps: four of `rows`, and three of `partials` if
-/// given.
-fn each_plane(
-    planes: &Planes,
-    rows: &mut [u32],
-    partials: &mut [u32],
-    mut twin: impl FnMut(&Plane, &mut [u32], &mut [u32]),
-) {
+/// Runs a twin of the loss on each plane, with the plane's own maps.
+fn run_loss(name: &str, planes: &Planes, buffers: &mut [Vec<u32>]) {
     for (number, plane) in planes.each[..planes.count as usize].iter().enumerate() {
         let size = (4 * plane.quads * plane.rows) as usize;
-        let own = |maps: usize| number * maps * size..(number + 1) * maps * size;
-        twin(
-            plane,
-            &mut rows[own(4)],
-            partials.get_mut(own(3)).unwrap_or_default(),
-        );
+        let rows_of = |rows: usize| number * rows * size..(number + 1) * rows * size;
+        let (rows, partials) = (rows_of(4), rows_of(3));
+        match (name, &mut *buffers) {
+            ("ssim_rows", [frame, targets, maps]) => {
+                ssim_rows(
+                    plane,
+                    cast_slice(frame),
+                    targets,
+                    cast_slice_mut(&mut maps[rows]),
+                );
+            }
+            ("ssim_columns", [maps, sums_of_rows, sums]) => ssim_columns(
+                plane,
+                cast_slice(&maps[rows]),
+                cast_slice_mut(&mut sums_of_rows[partials]),
+                cast_slice_mut(sums),
+            ),
+            ("ssim_backward_rows", [sums_of_rows, maps]) => ssim_backward_rows(
+                plane,
+                cast_slice(&sums_of_rows[partials]),
+                cast_slice_mut(&mut maps[rows]),
+            ),
+            ("loss_gradient", [frame, targets, maps, gradient, sums]) => loss_gradient(
+                plane,
+                cast_slice(frame),
+                targets,
+                cast_slice(&maps[rows]),
+                cast_slice_mut(gradient),
+                cast_slice_mut(sums),
+            ),
+            (name, buffers) => panic!("{name} with {} buffers", buffers.len()),
+        }
     }
+}
+
+fn job(uniform: &[u8]) -> ChunkJob {
+    of(uniform)
+}
+
+fn of<T: Pod>(bytes: &[u8]) -> T {
+    bytemuck::pod_read_unaligned(&bytes[..size_of::<T>()])
 }

@@ -84,100 +84,44 @@ impl ListBuilder {
         gpu: &Gpu,
         kernels: &Kernels,
         g: &Gaussians,
-        mut view: View,
+        view: View,
         kind: Kind,
         on_cpu: &mut usize,
     ) -> Result<Lists> {
         self.prepare_tiles(gpu, &view)?;
-        let n = g.n as u32;
-        let groups = n.div_ceil(GROUP);
-        let (sorting, listing) = (&kernels.sorting, &kernels.listing);
-        let Gaussians {
-            touched,
-            offsets,
-            footprints,
-            first_pair,
-            ..
-        } = g;
-        let mut r = Recorder::new(gpu, *on_cpu);
-        project(kernels, &mut r, g, &view, kind)?;
-        let side = g.sort.record(gpu, sorting, &mut r, n, 24)?;
-        let order = &g.sort.values[side];
-        r.run(
-            &listing.gather_counts,
-            &view,
-            GatherCountsBuffers {
-                order,
-                touched,
-                offsets,
-            },
-            groups,
-        )?;
-        g.scan.record(gpu, sorting, &mut r, offsets, n)?;
-        *on_cpu = r.submit();
-        // The pairs are counted before any is written, so no list can overflow.
-        view.pairs = g.scan.total(gpu, n)?;
-        if view.pairs == u32::MAX {
-            let reason = "more than 4 billion (tile, Gaussian) pairs: some Gaussians are too large; remove them, or lower the option size";
-            return Err(Error::TooLarge(reason.to_owned()));
-        }
+        let (view, order) = count_pairs(gpu, kernels, g, view, kind, on_cpu)?;
         self.prepare_pairs(gpu, view.pairs as usize)?;
-        let (pairs, tiles) = (
-            self.pairs.as_ref().expect("prepared"),
-            self.tiles.as_ref().expect("prepared"),
-        );
+        let pairs = self.pairs.as_ref().expect("prepared");
+        let tiles = self.tiles.as_ref().expect("prepared");
         let mut r = Recorder::new(gpu, *on_cpu);
-        let (pair_tiles, pair_gaussians, ranges) =
-            (&pairs.sort.keys[0], &pairs.gaussians, &tiles.ranges);
-        let emitted = EmitBuffers {
-            order,
-            offsets,
-            footprints,
-            touched,
-            pair_tiles,
-            pair_gaussians,
-            first_pair,
-        };
-        r.run(
-            &listing.emit,
-            &view,
-            emitted,
-            (n * gpu.shape.writers()).div_ceil(GROUP),
-        )?;
-        let sorted = pairs
-            .sort
-            .record(gpu, sorting, &mut r, view.pairs, tile_bits(&view))?;
+        let sorted = record_pairs(gpu, kernels, &mut r, g, &view, order, pairs)?;
+        let ranges = &tiles.ranges;
         r.clear(ranges);
         let sorted_tiles = &pairs.sort.keys[sorted];
-        r.run(
-            &listing.tile_ranges,
-            &view,
-            TileRangesBuffers {
-                sorted_tiles,
-                ranges,
-            },
-            view.pairs.div_ceil(GROUP),
-        )?;
+        let buffers = TileRangesBuffers {
+            sorted_tiles,
+            ranges,
+        };
+        let groups = view.pairs.div_ceil(GROUP);
+        r.run(&kernels.listing.tile_ranges, &view, buffers, groups)?;
         let keys = &tiles.sort.keys[0];
-        r.run(
-            &listing.tile_load,
-            &view,
-            TileLoadBuffers { ranges, keys },
-            view.tile_count().div_ceil(GROUP),
-        )?;
+        let buffers = TileLoadBuffers { ranges, keys };
+        let tile_count = view.tile_count();
+        let groups = tile_count.div_ceil(GROUP);
+        r.run(&kernels.listing.tile_load, &view, buffers, groups)?;
         let ordered = tiles
             .sort
-            .record(gpu, sorting, &mut r, view.tile_count(), 8)?;
+            .record(gpu, &kernels.sorting, &mut r, tile_count, 8)?;
         *on_cpu = r.submit();
         Ok(Lists {
             view,
             order: order.clone(),
-            touched: touched.clone(),
-            first_pair: first_pair.clone(),
+            touched: g.touched.clone(),
+            first_pair: g.first_pair.clone(),
             ranges: ranges.clone(),
             tile_order: tiles.sort.values[ordered].clone(),
             sorted_pairs: pairs.sort.values[sorted].clone(),
-            pair_gaussians: pair_gaussians.clone(),
+            pair_gaussians: pairs.gaussians.clone(),
         })
     }
 
@@ -275,6 +219,67 @@ impl ListBuilder {
             .map_or(0, |t| t.ranges.size() + t.sort.bytes());
         memory.views += self.frozen.values().map(Lists::bytes).sum::<u64>();
     }
+}
+
+/// Projects the Gaussians, sorts them by depth and counts their pairs. Returns the view with the
+/// number of pairs, and the order of the Gaussians. Pairs are counted before any is written, so that
+/// no list can overflow.
+fn count_pairs<'a>(
+    gpu: &Gpu,
+    kernels: &Kernels,
+    g: &'a Gaussians,
+    view: View,
+    kind: Kind,
+    on_cpu: &mut usize,
+) -> Result<(View, &'a Buffer)> {
+    let n = g.n as u32;
+    let mut r = Recorder::new(gpu, *on_cpu);
+    project(kernels, &mut r, g, &view, kind)?;
+    let side = g.sort.record(gpu, &kernels.sorting, &mut r, n, 24)?;
+    let order = &g.sort.values[side];
+    let buffers = GatherCountsBuffers {
+        order,
+        touched: &g.touched,
+        offsets: &g.offsets,
+    };
+    let groups = n.div_ceil(GROUP);
+    r.run(&kernels.listing.gather_counts, &view, buffers, groups)?;
+    g.scan
+        .record(gpu, &kernels.sorting, &mut r, &g.offsets, n)?;
+    *on_cpu = r.submit();
+    let pairs = g.scan.total(gpu, n)?;
+    if pairs == u32::MAX {
+        let reason = "more than 4 billion (tile, Gaussian) pairs: some Gaussians are too large; remove them, or lower the option size";
+        return Err(Error::TooLarge(reason.to_owned()));
+    }
+    Ok((View { pairs, ..view }, order))
+}
+
+/// Records writing the pairs and sorting them by tile. Returns which of the two buffers of the sort
+/// holds the result.
+fn record_pairs(
+    gpu: &Gpu,
+    kernels: &Kernels,
+    r: &mut Recorder,
+    g: &Gaussians,
+    view: &View,
+    order: &Buffer,
+    pairs: &Pairs,
+) -> Result<usize> {
+    let buffers = EmitBuffers {
+        order,
+        offsets: &g.offsets,
+        footprints: &g.footprints,
+        touched: &g.touched,
+        pair_tiles: &pairs.sort.keys[0],
+        pair_gaussians: &pairs.gaussians,
+        first_pair: &g.first_pair,
+    };
+    let groups = (g.n as u32 * gpu.shape.writers()).div_ceil(GROUP);
+    r.run(&kernels.listing.emit, view, buffers, groups)?;
+    pairs
+        .sort
+        .record(gpu, &kernels.sorting, r, view.pairs, tile_bits(view))
 }
 
 /// Records the projection of all pages.
