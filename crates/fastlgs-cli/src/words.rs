@@ -273,36 +273,7 @@ pub fn teach(r: &fastlgs::teach::TeachReport) -> String {
 }
 
 pub fn eval(r: &fastlgs::eval::EvalReport) -> String {
-    let two_decimals =
-        |value: Option<f64>| value.map_or_else(|| "-".to_owned(), |v| format!("{v:.2}"));
-    let aligned = r
-        .psnr_aligned
-        .map(|p| format!(", {p:.2} dB with aligned poses"))
-        .unwrap_or_default();
-    let colour = r.psnr.map(|_| {
-        format!(
-            "{}{aligned}, SSIM {:.3}, on held-out photos",
-            decibels(r.psnr),
-            r.ssim.unwrap_or_default()
-        )
-    });
-    let labelled = r.labels_scored > 0;
-    let if_labelled = |words: String| if labelled { words } else { String::new() };
-    let outcomes = r.outcomes.iter().map(|(outcome, count)| {
-        let words = match outcome {
-            Outcome::Right => "correct",
-            Outcome::Refused => "not found",
-            Outcome::WrongLevel => "with the wrong level",
-            Outcome::WrongObject => "with the wrong object",
-            Outcome::WrongMask => "with a wrong mask",
-        };
-        format!("{count} {words}")
-    });
-    let coloured = r
-        .absent_colored_rejected
-        .map(|share| format!(", {:.0} % with a colour added", 100.0 * share))
-        .unwrap_or_default();
-    let mut text = table(&[
+    let mut rows = vec![
         (
             "scene",
             format!(
@@ -313,65 +284,101 @@ pub fn eval(r: &fastlgs::eval::EvalReport) -> String {
                 r.scene_bytes as f64 / 1e6
             ),
         ),
-        ("colour", colour.unwrap_or_default()),
-        (
-            "objects",
-            if_labelled(format!(
-                "oracle mIoU {} over {} labels in {} views",
-                two_decimals(r.oracle_miou),
-                r.labels_scored,
-                r.views_scored
-            )),
-        ),
-        (
-            "texts",
-            if_labelled(format!(
-                "mIoU {}: {}",
-                two_decimals(r.miou),
-                outcomes.collect::<Vec<_>>().join(", ")
-            )),
-        ),
-        (
-            "absent",
-            if_labelled(format!(
-                "{} of {} absent names are rejected{coloured}; AUROC {}",
-                r.absent_rejected,
-                r.absent_texts,
-                two_decimals(r.absent_auroc)
-            )),
-        ),
-        (
-            "query",
-            r.query_ms_first
-                .map(|first| {
-                    format!(
-                        "{first:.0} ms for the first text in a view, {:.0} ms for the next ({})",
-                        r.query_ms_next.unwrap_or_default(),
-                        r.adapter
-                    )
-                })
-                .unwrap_or_default(),
-        ),
-    ]);
-    let width = r
-        .oracle_by_label
-        .keys()
-        .map(|name| name.chars().count())
-        .max()
-        .unwrap_or(0);
+        ("colour", eval_color(r)),
+    ];
+    if r.labels_scored > 0 {
+        rows.extend(eval_labels(r));
+    }
+    if let Some(first) = r.query_ms_first {
+        let next = r.query_ms_next.unwrap_or_default();
+        let text = format!(
+            "{first:.0} ms for the first text in a view, {next:.0} ms for the next ({})",
+            r.adapter
+        );
+        rows.push(("query", text));
+    }
+    let names = r.oracle_by_label.keys();
+    let width = names.map(|name| name.chars().count()).max().unwrap_or(0);
+    let mut text = table(&rows);
     for (name, oracle) in &r.oracle_by_label {
         let asked = two_decimals(r.miou_by_label.get(name).copied().flatten());
-        let place = r
+        let rank = r
             .oracle_rank_by_label
             .get(name)
             .map(|rank| format!(" (rank {rank} for the text)"))
             .unwrap_or_default();
         text += &format!(
-            "\n  {name:width$}  text IoU {asked}, oracle IoU {}{place}",
+            "\n  {name:width$}  text IoU {asked}, oracle IoU {}{rank}",
             two_decimals(*oracle)
         );
     }
     text
+}
+
+fn two_decimals(value: Option<f64>) -> String {
+    value.map_or_else(|| "-".to_owned(), |v| format!("{v:.2}"))
+}
+
+/// Colour of the held-out photos; empty if none was measured.
+fn eval_color(r: &fastlgs::eval::EvalReport) -> String {
+    let Some(_) = r.psnr else {
+        return String::new();
+    };
+    let aligned = r
+        .psnr_aligned
+        .map(|p| format!(", {p:.2} dB with aligned poses"))
+        .unwrap_or_default();
+    format!(
+        "{}{aligned}, SSIM {:.3}, on held-out photos",
+        decibels(r.psnr),
+        r.ssim.unwrap_or_default()
+    )
+}
+
+/// Rows of the labels and of absent names.
+fn eval_labels(r: &fastlgs::eval::EvalReport) -> [(&'static str, String); 3] {
+    let outcomes = r.outcomes.iter().map(|(outcome, count)| {
+        let words = match outcome {
+            Outcome::Right => "correct",
+            Outcome::Refused => "not found",
+            Outcome::WrongLevel => "with the wrong level",
+            Outcome::WrongObject => "with the wrong object",
+            Outcome::WrongMask => "with a wrong mask",
+        };
+        format!("{count} {words}")
+    });
+    let colored = r
+        .absent_colored_rejected
+        .map(|share| format!(", {:.0} % with a colour added", 100.0 * share))
+        .unwrap_or_default();
+    [
+        (
+            "objects",
+            format!(
+                "oracle mIoU {} over {} labels in {} views",
+                two_decimals(r.oracle_miou),
+                r.labels_scored,
+                r.views_scored
+            ),
+        ),
+        (
+            "texts",
+            format!(
+                "mIoU {}: {}",
+                two_decimals(r.miou),
+                outcomes.collect::<Vec<_>>().join(", ")
+            ),
+        ),
+        (
+            "absent",
+            format!(
+                "{} of {} absent names are rejected{colored}; AUROC {}",
+                r.absent_rejected,
+                r.absent_texts,
+                two_decimals(r.absent_auroc)
+            ),
+        ),
+    ]
 }
 
 #[cfg(test)]

@@ -72,25 +72,8 @@ pub fn calibrate(choice: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
         );
     }
     let image_tower = choice.clip_files()?[0].clone();
-    let tower = choice.clip_image()?;
-    let encoders = Background::ALL.map(|background| tower.clone().with_background(background));
+    let scenes_by_background = embedded_scenes(choice, run)?;
     let texts = choice.text_encoder()?;
-    let pictures = models::pictures_dir();
-    let mut worlds = TABLES
-        .iter()
-        .map(|seed| Kind::Table.world(&pictures, VIEWS, SIZE, *seed))
-        .collect::<Result<Vec<_>, _>>()?;
-    // The room needs pictures that may not be installed; the tables do not.
-    worlds.extend(Kind::Room.world(&pictures, VIEWS, SIZE, 0).ok());
-    let work = run.work("calibrate", (worlds.len() * VIEWS) as u64);
-    let mut scenes_by_background: Vec<Vec<GeneratedScene>> =
-        Background::ALL.map(|_| Vec::new()).into();
-    for world in worlds {
-        embed_world(&world, &encoders, || work.advance())?
-            .into_iter()
-            .zip(&mut scenes_by_background)
-            .for_each(|(seen, known)| known.push(seen));
-    }
     let canonical = texts.embed(&CANONICAL)?;
     let anything = Calibration::CLIP.anything;
     let query = |text: &str| -> Result<TextQuery> {
@@ -153,6 +136,28 @@ pub fn calibrate(choice: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
         kept,
         seconds: clock.elapsed().as_secs_f64(),
     })
+}
+
+/// Embeds the generated scenes, once for each background of the crops.
+fn embedded_scenes(choice: &ModelChoice, run: &Run) -> Result<Vec<Vec<GeneratedScene>>> {
+    let tower = choice.clip_image()?;
+    let encoders = Background::ALL.map(|background| tower.clone().with_background(background));
+    let pictures = models::pictures_dir();
+    let mut worlds = TABLES
+        .iter()
+        .map(|seed| Kind::Table.world(&pictures, VIEWS, SIZE, *seed))
+        .collect::<Result<Vec<_>, _>>()?;
+    // The room needs pictures that may not be installed; the tables do not.
+    worlds.extend(Kind::Room.world(&pictures, VIEWS, SIZE, 0).ok());
+    let work = run.work("calibrate", (worlds.len() * VIEWS) as u64);
+    let mut scenes: Vec<Vec<GeneratedScene>> = Background::ALL.map(|_| Vec::new()).into();
+    for world in worlds {
+        let embedded = embed_world(&world, &encoders, || work.advance())?;
+        for (scenes, scene) in scenes.iter_mut().zip(embedded) {
+            scenes.push(scene);
+        }
+    }
+    Ok(scenes)
 }
 
 /// Renders a generated scene and embeds its objects by their exact masks, once for each encoder.

@@ -107,29 +107,53 @@ pub fn names_folder(path: &Path) -> bool {
 /// # Errors
 /// A scene that was never trained, an output that cannot be written, or a failing device.
 pub fn export(config: &ExportConfig, run: &Run) -> Result<ExportReport> {
-    if config.output.extension().is_some_and(|e| e == "json") {
-        let folder = SceneFolder::open(&config.scene)?;
-        let cameras = folder.cameras()?;
-        camera_path::write(&config.output, &cameras, &folder.manifest()?.frame)?;
-        return Ok(ExportReport::Path {
-            scene: config.scene.clone(),
-            output: config.output.clone(),
-            frames: cameras.len(),
-        });
+    match output_kind(&config.output)? {
+        OutputKind::CameraPath => {
+            let folder = SceneFolder::open(&config.scene)?;
+            let cameras = folder.cameras()?;
+            camera_path::write(&config.output, &cameras, &folder.manifest()?.frame)?;
+            Ok(ExportReport::Path {
+                scene: config.scene.clone(),
+                output: config.output.clone(),
+                frames: cameras.len(),
+            })
+        }
+        kind => Ok(ExportReport::Scene(Box::new(export_scene(
+            config, kind, run,
+        )?))),
     }
-    let ending = config
-        .output
-        .extension()
-        .and_then(|e| e.to_str())
-        .unwrap_or_default();
-    let folder = names_folder(&config.output);
-    let file = !folder && selection::EXTENSIONS.contains(&ending);
-    if !folder && !file && !ending.is_empty() {
-        let path = config.output.display();
+}
+
+/// What an export writes.
+#[derive(PartialEq)]
+enum OutputKind {
+    /// A JSON file of all cameras.
+    CameraPath,
+    /// A file of Gaussians, such as .spz.
+    Gaussians,
+    /// A scene folder with everything that queries need.
+    Folder,
+}
+
+fn output_kind(path: &Path) -> Result<OutputKind> {
+    let ending = path.extension().and_then(|e| e.to_str());
+    let ending = ending.unwrap_or_default();
+    if ending == "json" {
+        Ok(OutputKind::CameraPath)
+    } else if names_folder(path) || ending.is_empty() {
+        Ok(OutputKind::Folder)
+    } else if selection::EXTENSIONS.contains(&ending) {
+        Ok(OutputKind::Gaussians)
+    } else {
         bail!(
-            "{path}: the format .{ending} is unknown; use .ply, .spz, .sog, .glb or .json, or name a folder (without extension, or with / at the end)"
-        );
+            "{}: the format .{ending} is unknown; use .ply, .spz, .sog, .glb or .json, or name a folder (without extension, or with / at the end)",
+            path.display()
+        )
     }
+}
+
+/// Exports Gaussians or a folder, and compares the result with the scene.
+fn export_scene(config: &ExportConfig, kind: OutputKind, run: &Run) -> Result<SceneReport> {
     let mut scene = Scene::open(&config.scene, run.device)?;
     let held_out = scene.manifest().held_out(scene.cameras());
     // Without held-out views, one training view measures the loss.
@@ -146,47 +170,41 @@ pub fn export(config: &ExportConfig, run: &Run) -> Result<ExportReport> {
     if degree < scene.gaussians().sh_degree {
         scene.set_gaussians(scene.gaussians().clone().with_sh_degree(degree))?;
     }
-    let (written, precision) = if file {
+    let (written, bytes_a_value) = if kind == OutputKind::Gaussians {
         let world = selection::World::of(scene.manifest(), scene.cameras());
         selection::write(&config.output, scene.gaussians(), &world)?;
-        let written = match ending {
-            // glTF stores the floats unchanged.
-            "glb" => scene.gaussians().clone(),
-            _ => splat_file::read(&config.output, &world.frame)?.0,
+        // glTF stores the floats unchanged.
+        let written = if config.output.extension().is_some_and(|e| e == "glb") {
+            scene.gaussians().clone()
+        } else {
+            splat_file::read(&config.output, &world.frame)?.0
         };
         (written, None)
     } else {
         let (written, precision) = small_folder(&mut scene, &config.output)?;
-        (
-            written,
-            Some(
-                precision
-                    .by_group()
-                    .into_iter()
-                    .map(|(group, bytes)| (group.to_owned(), bytes))
-                    .collect(),
-            ),
-        )
+        let by_group = precision.by_group().into_iter();
+        let by_group = by_group.map(|(group, bytes)| (group.to_owned(), bytes));
+        (written, Some(by_group.collect()))
     };
     scene.set_gaussians(written)?;
     let after = pictures(&mut scene, &measured_views)?;
     // Compare renders with renders: an exported scene may have no photos.
     let same: Vec<f64> = before.iter().zip(&after).map(|(a, b)| psnr(b, a)).collect();
-    Ok(ExportReport::Scene(Box::new(SceneReport {
+    Ok(SceneReport {
         scene: config.scene.clone(),
         output: config.output.clone(),
         bytes: bytes_of(&config.output),
         bytes_before: crate::scene::query_file_bytes(&config.scene),
         gaussians: scene.gaussians().len(),
         sh_degree: scene.gaussians().sh_degree,
-        bytes_a_value: precision,
+        bytes_a_value,
         psnr_held_out: BeforeAfter {
             before: mean_psnr_to_photos(&scene, &held_out, &before)?,
             after: mean_psnr_to_photos(&scene, &held_out, &after)?,
         },
         psnr_against_original: same.iter().sum::<f64>() / same.len().max(1) as f64,
         adapter: scene.adapter(),
-    })))
+    })
 }
 
 /// Renders the colours of views, `[3][h][w]` each.

@@ -218,9 +218,39 @@ pub fn eval_scene(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport> {
         false_alarms: config.false_alarms,
         ..QueryConfig::default()
     };
-    let total: usize = views.iter().map(|v| v.labels.len()).sum();
+    let sums = score_views(&mut scene, &grid, config, &query, &views)?;
+    let absent = absent_scores(config, &scene, &grid, &views)?;
+    let colored = colored_absent_scores(&absent, &scene, &grid)?;
+    let camera = &scene.cameras()[0];
+    let report = EvalReport {
+        scene: config.scene.clone(),
+        views_scored: views.len(),
+        labels_total: views.iter().map(|v| v.labels.len()).sum(),
+        psnr: color.map(|c| c.psnr),
+        psnr_aligned: color.map(|c| c.psnr_aligned),
+        psnr_affine: color.map(|c| c.psnr_affine),
+        ssim: color.map(|c| c.ssim),
+        gaussians: scene.gaussians().len(),
+        objects: grid.objects.len(),
+        scene_bytes: crate::scene::query_file_bytes(&config.scene),
+        size: format!("{}x{}", camera.width, camera.height),
+        adapter: scene.adapter(),
+        ..EvalReport::default()
+    };
+    let report = with_absent(report, &absent, &colored, &query, &sums.present);
+    Ok(with_labels(report, sums))
+}
+
+/// Scores all labels of the views.
+fn score_views(
+    scene: &mut Scene,
+    grid: &Grid,
+    config: &EvalConfig,
+    query: &QueryConfig,
+    views: &[LabelledView],
+) -> Result<Sums> {
     let mut sums = Sums::default();
-    for view in &views {
+    for view in views {
         let index = scene
             .folder()
             .view_index(scene.cameras(), &view.name)
@@ -236,11 +266,12 @@ pub fn eval_scene(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport> {
         let started = Instant::now();
         let field = scene.field(&camera, config.tau_ac)?;
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
+        // Loads the text encoder before the first query is timed.
+        scene.text_query("warm up")?;
         let mut best = Vec::new();
         for (k, label) in view.labels.iter().enumerate() {
-            let (ms, masks) = score_label(
-                &scene, &grid, &query, view, label, &camera, &field, &mut sums,
-            )?;
+            let (ms, masks) =
+                score_label(scene, grid, query, view, label, &camera, &field, &mut sums)?;
             if k == 0 {
                 sums.first_ms.push(render_ms + ms)
             } else {
@@ -250,87 +281,75 @@ pub fn eval_scene(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport> {
         }
         sums.apart.extend(label_separation(&best));
     }
-    let absent = absent_scores(config, &scene, &grid, &views)?;
-    let rejected = |absent: &[(String, f64)]| {
-        absent
-            .iter()
-            .filter(|a| a.1 < f64::from(query.min_score()))
-            .count()
+    Ok(sums)
+}
+
+/// Adds the results of absent names to a report. `present` holds the scores of the labels.
+fn with_absent(
+    report: EvalReport,
+    absent: &[(String, f64)],
+    colored: &[(String, f64)],
+    query: &QueryConfig,
+    present: &[f64],
+) -> EvalReport {
+    let rejected = |names: &[(String, f64)]| {
+        let is_rejected = |name: &&(String, f64)| name.1 < f64::from(query.min_score());
+        names.iter().filter(is_rejected).count()
     };
-    let colored = colored_absent_scores(&absent, &scene, &grid)?;
-    let best_absent = absent.iter().max_by(|a, b| a.1.total_cmp(&b.1));
-    let auroc = metrics::auroc(
-        &sums.present,
-        &absent.iter().map(|a| a.1).collect::<Vec<_>>(),
-    );
-    let camera = &scene.cameras()[0];
-    Ok(EvalReport {
-        scene: config.scene.clone(),
-        views_scored: views.len(),
-        labels_scored: sums.iou.len(),
-        labels_total: total,
-        miou: mean(&sums.iou),
-        miou_by_label: sums
-            .by_label
+    let scores: Vec<f64> = absent.iter().map(|a| a.1).collect();
+    let auroc = metrics::auroc(present, &scores);
+    let best = absent.iter().max_by(|a, b| a.1.total_cmp(&b.1));
+    EvalReport {
+        absent_auroc: (!auroc.is_nan()).then_some(auroc),
+        absent_texts: absent.len(),
+        absent_rejected: rejected(absent),
+        absent_colored_rejected: (!colored.is_empty())
+            .then(|| rejected(colored) as f64 / colored.len() as f64),
+        absent_scores: absent.iter().cloned().collect(),
+        absent_best: best.map(|(text, score)| Absent {
+            text: text.clone(),
+            score: *score,
+        }),
+        ..report
+    }
+}
+
+/// Adds the means over all labels to a report.
+fn with_labels(report: EvalReport, sums: Sums) -> EvalReport {
+    let all_oracle: Vec<f64> = sums.oracle.values().flatten().copied().collect();
+    let all_ranks: Vec<usize> = sums.ranks.values().flatten().copied().collect();
+    let ranked_within = |first: usize| {
+        let within = all_ranks
             .iter()
-            .map(|(k, v)| (k.clone(), mean(v)))
-            .collect(),
+            .map(|rank| f64::from(u8::from(*rank <= first)));
+        mean(&within.collect::<Vec<_>>())
+    };
+    let by_label = |values: &BTreeMap<String, Vec<f64>>| {
+        let means = values.iter().map(|(label, v)| (label.clone(), mean(v)));
+        means.collect()
+    };
+    let worst_rank =
+        |(label, ranks): (&String, &Vec<usize>)| Some((label.clone(), *ranks.iter().max()?));
+    EvalReport {
+        labels_scored: sums.iou.len(),
+        miou: mean(&sums.iou),
+        miou_by_label: by_label(&sums.by_label),
         macc: mean(&sums.recall),
         boundary_iou: mean(&sums.boundary),
         oracle_boundary_iou: mean(&sums.oracle_boundary),
         loc_acc: mean(&sums.localised),
-        oracle_miou: mean(&sums.oracle.values().flatten().copied().collect::<Vec<_>>()),
-        oracle_by_label: sums
-            .oracle
-            .iter()
-            .map(|(k, v)| (k.clone(), mean(v)))
-            .collect(),
+        oracle_miou: mean(&all_oracle),
+        oracle_by_label: by_label(&sums.oracle),
         apart: mean(&sums.apart),
         text_top1: mean(&sums.top1),
-        oracle_ranked: [1, 3, 5].map(|first| {
-            mean(
-                &sums
-                    .ranks
-                    .values()
-                    .flatten()
-                    .map(|rank| f64::from(u8::from(*rank <= first)))
-                    .collect::<Vec<_>>(),
-            )
-        }),
-        oracle_rank_by_label: sums
-            .ranks
-            .iter()
-            .filter_map(|(k, v)| Some((k.clone(), *v.iter().max()?)))
-            .collect(),
+        oracle_ranked: [1, 3, 5].map(ranked_within),
+        oracle_rank_by_label: sums.ranks.iter().filter_map(worst_rank).collect(),
         outcomes: sums.outcomes,
-        absent_auroc: (!auroc.is_nan()).then_some(auroc),
-        absent_texts: absent.len(),
-        absent_rejected: rejected(&absent),
-        absent_colored_rejected: (!colored.is_empty())
-            .then(|| rejected(&colored) as f64 / colored.len() as f64),
-        absent_scores: absent.iter().cloned().collect(),
-        absent_best: best_absent.map(|(text, score)| Absent {
-            text: text.clone(),
-            score: *score,
-        }),
-        present_scores: sums
-            .labels
-            .iter()
-            .cloned()
-            .zip(sums.present.iter().copied())
-            .collect(),
-        psnr: color.map(|c| c.psnr),
-        psnr_aligned: color.map(|c| c.psnr_aligned),
-        psnr_affine: color.map(|c| c.psnr_affine),
-        ssim: color.map(|c| c.ssim),
-        gaussians: scene.gaussians().len(),
-        objects: grid.objects.len(),
-        scene_bytes: crate::scene::query_file_bytes(&config.scene),
+        present_scores: sums.labels.into_iter().zip(sums.present).collect(),
         query_ms_first: mean(&sums.first_ms),
         query_ms_next: mean(&sums.next_ms),
-        size: format!("{}x{}", camera.width, camera.height),
-        adapter: scene.adapter(),
-    })
+        ..report
+    }
 }
 
 /// Masks of a label and of the object that fits it best.
@@ -397,8 +416,6 @@ fn score_label(
             view.name
         );
     }
-    // Loads the text encoder before the query is timed.
-    scene.text_query("warm up")?;
     let started = Instant::now();
     let query::Found { ranked, targets } = ObjectQuery::Text(label.category.clone())
         .embed(scene, &[])?
@@ -406,38 +423,21 @@ fn score_label(
     let mask = field.mask(grid, &targets);
     let ms = started.elapsed().as_secs_f64() * 1e3;
     let iou = metrics::iou(&mask, &truth);
-    sums.iou.push(iou);
-    sums.by_label
-        .entry(label.category.clone())
-        .or_default()
-        .push(iou);
-    sums.recall.push(metrics::recall(&mask, &truth));
     // Width of the boundary: 2 % of the diagonal (Cheng et al., Boundary IoU).
     let band = (0.02 * f64::from(w).hypot(f64::from(h))).round().max(1.0) as u32;
-    sums.boundary
-        .push(metrics::boundary_iou(&mask, &truth, w, h, band));
-    let relevancy = field.relevancy(grid, &ranked);
-    sums.localised.push(f64::from(u8::from(metrics::peak_in_box(
-        &relevancy,
-        w,
-        h,
-        &view.boxes(label, w, h),
-    ))));
-    sums.labels.push(label.category.clone());
-    sums.present.push(f64::from(query::best_score(&ranked)));
+    let boxes = view.boxes(label, w, h);
+    let peak = metrics::peak_in_box(&field.relevancy(grid, &ranked), w, h, &boxes);
     // Oracle: the best single object. Top-1: whether more than half of the first-ranked object lies
     // in the label.
-    let object_mask = |id: u16| field.mask(grid, &[Hit { id, score: 0.0 }]);
     let (oracle, found, id) = best_object(grid, field, &truth);
-    sums.oracle_boundary
-        .push(metrics::boundary_iou(&found, &truth, w, h, band));
-    sums.ranks.entry(label.category.clone()).or_default().push(
-        ranked
-            .iter()
-            .position(|h| h.id == id)
-            .map_or(ranked.len(), |k| k)
-            + 1,
-    );
+    let rank = ranked.iter().position(|h| h.id == id);
+    let is_within = |id: u16| {
+        let mask = field.mask(grid, &[Hit { id, score: 0.0 }]);
+        let covered = mask.iter().zip(&truth).filter(|(m, _)| **m);
+        let (hit, all) = covered.fold((0, 0), |(h, a), (_, t)| (h + usize::from(*t), a + 1));
+        all > 0 && 2 * hit > all
+    };
+    let is_first = ranked.first().is_some_and(|first| is_within(first.id));
     let outcome = match targets.first() {
         None => Outcome::Refused,
         _ if iou >= MIN_RIGHT_IOU => Outcome::Right,
@@ -445,22 +445,22 @@ fn score_label(
         Some(first) if grid.related(id)[usize::from(first.id) - 1] => Outcome::WrongLevel,
         Some(_) => Outcome::WrongObject,
     };
+    let name = || label.category.clone();
+    sums.iou.push(iou);
+    sums.by_label.entry(name()).or_default().push(iou);
+    sums.recall.push(metrics::recall(&mask, &truth));
+    sums.boundary
+        .push(metrics::boundary_iou(&mask, &truth, w, h, band));
+    sums.localised.push(f64::from(u8::from(peak)));
+    sums.labels.push(name());
+    sums.present.push(f64::from(query::best_score(&ranked)));
+    sums.oracle.entry(name()).or_default().push(oracle);
+    sums.oracle_boundary
+        .push(metrics::boundary_iou(&found, &truth, w, h, band));
+    let rank = rank.unwrap_or(ranked.len()) + 1;
+    sums.ranks.entry(name()).or_default().push(rank);
+    sums.top1.push(f64::from(u8::from(is_first)));
     *sums.outcomes.entry(outcome).or_default() += 1;
-    sums.oracle
-        .entry(label.category.clone())
-        .or_default()
-        .push(oracle);
-    let inside = |mask: Vec<bool>| {
-        let (hit, all) = mask
-            .iter()
-            .zip(&truth)
-            .filter(|(m, _)| **m)
-            .fold((0, 0), |(h, a), (_, t)| (h + usize::from(*t), a + 1));
-        all > 0 && 2 * hit > all
-    };
-    sums.top1.push(f64::from(u8::from(
-        ranked.first().is_some_and(|r| inside(object_mask(r.id))),
-    )));
     Ok((ms, LabelMasks { truth, found }))
 }
 
