@@ -264,36 +264,7 @@ pub async fn query(State(app): App, request: Result<Json<QueryBody>, JsonRejecti
         body.camera.clone(),
         body.size.as_deref(),
     )?;
-    let object_query = match (&body.text, &body.point, &body.image) {
-        (Some(text), None, None) => ObjectQuery::Text(checked_text(text)?.to_owned()),
-        (None, Some(pixels), None) => match pixels.outside(&camera) {
-            None => ObjectQuery::Point(pixels.clone()),
-            Some((x, y)) => {
-                return Err(Failure::bad_request(format!(
-                    "the point {x},{y} lies outside the view of {}x{}",
-                    camera.width, camera.height
-                )));
-            }
-        },
-        (None, None, Some(data)) => {
-            let data = base64::engine::general_purpose::STANDARD
-                .decode(data)
-                .map_err(|e| Failure::bad_request(format!("image: {e}")))?;
-            // Decoded on a blocking thread, so that other requests are not delayed.
-            let decoded =
-                tokio::task::spawn_blocking(move || image_io::decode_rgb("image", &data)).await;
-            let decoded = decoded.map_err(|e| anyhow::anyhow!("image: {e}"))?;
-            ObjectQuery::Image(
-                "image".into(),
-                decoded.map_err(|e| Failure::bad_request(e.to_string()))?,
-            )
-        }
-        _ => {
-            return Err(Failure::bad_request(
-                "give exactly one of text, point and image",
-            ));
-        }
-    };
+    let object_query = object_query(&body, &camera).await?;
     if body
         .false_alarms
         .is_some_and(|share| !(share > 0.0 && share < 1.0))
@@ -312,46 +283,78 @@ pub async fn query(State(app): App, request: Result<Json<QueryBody>, JsonRejecti
         .iter()
         .map(|n| checked_text(n).map(str::to_owned))
         .collect::<Answer<Vec<_>>>()?;
-    let (want_mask, want_heat) = (body.mask, body.heatmap);
-    let choice = VisibleObjects {
-        hidden: body.hidden,
-        only: body.only,
-    };
     let work = move |worker: &mut SceneWorker| {
-        let defaults = QueryConfig::default();
-        let config = QueryConfig {
-            false_alarms: body.false_alarms.unwrap_or(defaults.false_alarms),
-            top_k: body.top_k.unwrap_or(defaults.top_k).max(1),
-        };
-        if !worker.set_visible(&choice)? {
-            return Err(Failure::bad_request(
-                "nothing would be left to query; hide fewer objects",
-            ));
-        }
-        let answer = worker
-            .scene
-            .query(object_query)
-            .camera(&camera)
-            .negatives(&negatives)
-            .false_alarms(config.false_alarms)
-            .top_k(config.top_k)
-            .candidates(body.candidates.unwrap_or(CANDIDATES))
-            .run()?;
-        let mask = (want_mask && answer.report.found)
-            .then(|| mask_picture(&answer.mask, camera.width, camera.height));
-        let relevancy = want_heat.then(|| answer.relevancy());
-        let mut value = serde_json::to_value(&answer.report).map_err(anyhow::Error::from)?;
-        if let Some(mask) = mask {
-            value["mask"] = data_url(mask)?;
-        }
-        if let Some(relevancy) = relevancy {
-            let frame = worker.scene.render(&camera)?;
-            let color = image_io::from_planar(frame.color(), frame.width, frame.height);
-            value["heatmap"] = data_url(heatmap(&color, &relevancy))?;
-        }
-        Ok(Json(value))
+        answer(worker, object_query, &camera, &negatives, &body).map(Json)
     };
     app.ready()?.run(work).await
+}
+
+/// Returns what a request asks for.
+async fn object_query(body: &QueryBody, camera: &Camera) -> Answer<ObjectQuery> {
+    match (&body.text, &body.point, &body.image) {
+        (Some(text), None, None) => Ok(ObjectQuery::Text(checked_text(text)?.to_owned())),
+        (None, Some(pixels), None) => match pixels.outside(camera) {
+            None => Ok(ObjectQuery::Point(pixels.clone())),
+            Some((x, y)) => Err(Failure::bad_request(format!(
+                "the point {x},{y} lies outside the view of {}x{}",
+                camera.width, camera.height
+            ))),
+        },
+        (None, None, Some(data)) => {
+            let data = base64::engine::general_purpose::STANDARD
+                .decode(data)
+                .map_err(|e| Failure::bad_request(format!("image: {e}")))?;
+            // Decoded on a blocking thread, so that other requests are not delayed.
+            let decoded =
+                tokio::task::spawn_blocking(move || image_io::decode_rgb("image", &data)).await;
+            let decoded = decoded.map_err(|e| anyhow::anyhow!("image: {e}"))?;
+            let picture = decoded.map_err(|e| Failure::bad_request(e.to_string()))?;
+            Ok(ObjectQuery::Image("image".into(), picture))
+        }
+        _ => Err(Failure::bad_request(
+            "give exactly one of text, point and image",
+        )),
+    }
+}
+
+/// Answers a query on the scene worker, with the pictures that the request asks for.
+fn answer(
+    worker: &mut SceneWorker,
+    object_query: ObjectQuery,
+    camera: &Camera,
+    negatives: &[String],
+    body: &QueryBody,
+) -> Answer<Value> {
+    let choice = VisibleObjects {
+        hidden: body.hidden.clone(),
+        only: body.only.clone(),
+    };
+    if !worker.set_visible(&choice)? {
+        return Err(Failure::bad_request(
+            "nothing would be left to query; hide fewer objects",
+        ));
+    }
+    let defaults = QueryConfig::default();
+    let answer = worker
+        .scene
+        .query(object_query)
+        .camera(camera)
+        .negatives(negatives)
+        .false_alarms(body.false_alarms.unwrap_or(defaults.false_alarms))
+        .top_k(body.top_k.unwrap_or(defaults.top_k).max(1))
+        .candidates(body.candidates.unwrap_or(CANDIDATES))
+        .run()?;
+    let mut value = serde_json::to_value(&answer.report).map_err(anyhow::Error::from)?;
+    if body.mask && answer.report.found {
+        value["mask"] = data_url(mask_picture(&answer.mask, camera.width, camera.height))?;
+    }
+    if body.heatmap {
+        let relevancy = answer.relevancy();
+        let frame = worker.scene.render(camera)?;
+        let color = image_io::from_planar(frame.color(), frame.width, frame.height);
+        value["heatmap"] = data_url(heatmap(&color, &relevancy))?;
+    }
+    Ok(value)
 }
 
 fn data_url(picture: impl Into<DynamicImage>) -> Answer<Value> {

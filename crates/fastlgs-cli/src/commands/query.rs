@@ -21,7 +21,7 @@ use fastlgs_grid::query::QueryConfig;
 use fastlgs_raster::Frame;
 use serde_json::json;
 use std::io::{BufRead, IsTerminal, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 #[derive(clap::Args)]
@@ -183,56 +183,11 @@ struct QueryRunner<'a> {
 
 pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     if let Some(root) = &args.scenes_below {
-        // With --library, the first positional argument is a text, not a scene.
-        let first = args
-            .scene
-            .iter()
-            .map(|text| text.to_string_lossy().into_owned());
-        let texts: Vec<String> = first.chain(args.text.iter().cloned()).collect();
-        if texts.is_empty() {
-            bail!("--library: give a text to find, or '-' to read texts from standard input");
-        }
-        if !args.image.is_empty()
-            || !args.point.is_empty()
-            || args.output.is_some()
-            || args.export.is_some()
-            || args.export_rest.is_some()
-        {
-            bail!(
-                "--library accepts only texts; query a single scene for pictures, pixels, exports and output files"
-            );
-        }
-        if args.views.is_given() || args.heatmap || args.dilate.is_some() || args.tau_ac.is_some() {
-            bail!(
-                "--library renders no view; leave out the options for views, masks and heat maps"
-            );
-        }
-        let (negatives, clip_text) = (args.negative.clone(), args.clip_text.clone());
-        let config = fastlgs::library::SearchConfig {
-            scenes: args.scenes,
-            false_alarms: args.false_alarms,
-            negatives,
-            clip_text,
-        };
-        return library::run(root, config, &texts, common, run);
+        return search_library(root, args, common, run);
     }
-    let by_example = !args.point.is_empty() || !args.image.is_empty();
-    if by_example && !args.text.is_empty() {
-        bail!("query in one way: by text, by --point or by --image");
-    }
-    let lines = args.text.iter().any(|t| t == "-");
-    if lines && (args.text.len() > 1 || !args.image.is_empty() || !args.point.is_empty()) {
-        bail!(
-            "'-' reads all texts from standard input; leave out other texts, --image and --point"
-        );
-    }
-    if args.heatmap && args.output.is_none() {
-        bail!("--heatmap writes a picture; give its folder with -o");
-    }
+    let reads_lines = args.text.iter().any(|t| t == "-");
     let exports = args.export.is_some() || args.export_rest.is_some();
-    if lines && exports {
-        bail!("--export and --export-rest need a single query; leave out '-'");
-    }
+    check(args, reads_lines, exports)?;
     let Some(path) = &args.scene else {
         bail!("no scene is given; name a trained scene folder")
     };
@@ -257,13 +212,60 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         tiles: Vec::new(),
         output: args.output.clone(),
     };
-    match lines {
+    match reads_lines {
         true if std::io::stdin().is_terminal() && std::io::stdout().is_terminal() => {
             runner.run_dialogue()
         }
         true => runner.answer_lines(),
         false => runner.answer_arguments(common),
     }
+}
+
+/// Refuses options that contradict each other.
+fn check(args: &Args, reads_lines: bool, exports: bool) -> Result<()> {
+    let by_example = !args.point.is_empty() || !args.image.is_empty();
+    if by_example && !args.text.is_empty() {
+        bail!("query in one way: by text, by --point or by --image");
+    }
+    if reads_lines && args.text.len() > 1 {
+        bail!("'-' reads all texts from standard input; leave out other texts");
+    }
+    if args.heatmap && args.output.is_none() {
+        bail!("--heatmap writes a picture; give its folder with -o");
+    }
+    if reads_lines && exports {
+        bail!("--export and --export-rest need a single query; leave out '-'");
+    }
+    Ok(())
+}
+
+/// Runs `--library`: texts are found in all scenes below a folder.
+fn search_library(root: &Path, args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
+    // With --library, the first positional argument is a text, not a scene.
+    let first = args
+        .scene
+        .iter()
+        .map(|text| text.to_string_lossy().into_owned());
+    let texts: Vec<String> = first.chain(args.text.iter().cloned()).collect();
+    if texts.is_empty() {
+        bail!("--library: give a text to find, or '-' to read texts from standard input");
+    }
+    let writes = args.output.is_some() || args.export.is_some() || args.export_rest.is_some();
+    if !args.image.is_empty() || !args.point.is_empty() || writes {
+        bail!(
+            "--library accepts only texts; query a single scene for pictures, pixels, exports and output files"
+        );
+    }
+    if args.views.is_given() || args.heatmap || args.dilate.is_some() || args.tau_ac.is_some() {
+        bail!("--library renders no view; leave out the options for views, masks and heat maps");
+    }
+    let config = fastlgs::library::SearchConfig {
+        scenes: args.scenes,
+        false_alarms: args.false_alarms,
+        negatives: args.negative.clone(),
+        clip_text: args.clip_text.clone(),
+    };
+    library::run(root, config, &texts, common, run)
 }
 
 impl QueryRunner<'_> {

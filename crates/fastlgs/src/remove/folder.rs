@@ -42,40 +42,10 @@ pub fn write(
     let mut manifest = session.manifest().clone();
     let held_out = manifest.held_out(session.cameras());
     for (camera, hidden) in views {
-        let w = camera.width;
         if held_out.iter().any(|c| c.name == camera.name) {
-            let path = folder.ignore_path(&camera.name);
-            let before = path
-                .is_file()
-                .then(|| image_io::load_gray(&path))
-                .transpose()?;
-            let counts = |x: u32, y: u32| before.as_ref().map_or(255, |b| b.get_pixel(x, y)[0]);
-            let mask = GrayImage::from_fn(w, camera.height, |x, y| {
-                Luma([if hidden[(y * w + x) as usize] {
-                    0
-                } else {
-                    counts(x, y)
-                }])
-            });
-            image_io::save_png(&path, mask)?;
-            continue;
-        }
-        let mut photo = folder.photo(&camera.name)?;
-        let counts = pixels_that_count(folder, &camera.name, hidden.len())?;
-        patch(&mut photo, hidden, &counts, session.render(camera)?.color());
-        image_io::save_png(&folder.photo_path(&camera.name), photo)?;
-        if folder.masks_path(&camera.name).is_file() {
-            let mut masks = folder.masks(camera)?;
-            let (width, height) = (masks.width, masks.height);
-            masks.masks.retain(|mask| {
-                let own = mask
-                    .runs
-                    .pixel_indices(width, height)
-                    .filter(|p| hidden[*p])
-                    .count();
-                (own as f64) < MIN_HIDDEN_SHARE * mask.runs.area() as f64
-            });
-            masks.save(&folder.masks_path(&camera.name))?;
+            ignore_hidden(folder, camera, hidden)?;
+        } else {
+            replace_hidden(folder, session, camera, hidden)?;
         }
     }
     // The masks have other labels now, so the pairs of the original scene are invalid.
@@ -102,6 +72,47 @@ pub fn write(
         .into_iter()
         .map(|camera| SceneFolder::objects_name(&camera.name));
     staged.publish(&scene, &[], maps, &manifest)
+}
+
+/// Adds the hidden pixels of a held-out view to its ignore mask.
+fn ignore_hidden(folder: &SceneFolder, camera: &Camera, hidden: &[bool]) -> Result<()> {
+    let path = folder.ignore_path(&camera.name);
+    let before = path
+        .is_file()
+        .then(|| image_io::load_gray(&path))
+        .transpose()?;
+    let counts = |x: u32, y: u32| before.as_ref().map_or(255, |b| b.get_pixel(x, y)[0]);
+    let mask = GrayImage::from_fn(camera.width, camera.height, |x, y| {
+        let is_hidden = hidden[(y * camera.width + x) as usize];
+        Luma([if is_hidden { 0 } else { counts(x, y) }])
+    });
+    Ok(image_io::save_png(&path, mask)?)
+}
+
+/// Replaces the hidden pixels of a training photo by rendered colours, and removes the masks of the
+/// object.
+fn replace_hidden(
+    folder: &SceneFolder,
+    scene: &mut Scene,
+    camera: &Camera,
+    hidden: &[bool],
+) -> Result<()> {
+    let mut photo = folder.photo(&camera.name)?;
+    let counts = pixels_that_count(folder, &camera.name, hidden.len())?;
+    patch(&mut photo, hidden, &counts, scene.render(camera)?.color());
+    image_io::save_png(&folder.photo_path(&camera.name), photo)?;
+    let path = folder.masks_path(&camera.name);
+    if !path.is_file() {
+        return Ok(());
+    }
+    let mut masks = folder.masks(camera)?;
+    let (width, height) = (masks.width, masks.height);
+    masks.masks.retain(|mask| {
+        let pixels = mask.runs.pixel_indices(width, height);
+        let covered = pixels.filter(|p| hidden[*p]).count();
+        (covered as f64) < MIN_HIDDEN_SHARE * mask.runs.area() as f64
+    });
+    Ok(masks.save(&path)?)
 }
 
 /// Returns the pixels of a photo that count: opaque ones that no mask ignores.
