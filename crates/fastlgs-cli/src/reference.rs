@@ -142,13 +142,19 @@ fn usage(option: &Arg) -> String {
     }
 }
 
+/// Python types of options whose values have a type of their own in Rust.
+const OWN_TYPES: [(&str, &str); 2] = [
+    ("background", "Dict[str, Any]"),
+    ("budget", "Optional[int]"),
+];
+
 /// Returns `fastlgs/options.py`: a `TypedDict` of the options of each stage. A key is a field of the
 /// stage's configuration; its type and help are those of the command line.
 fn python_options() -> String {
     let mut out = String::from(
         "\"\"\"Options of the stages, generated from the command line: keyword arguments of the functions.\"\"\"\n\n\
          from os import PathLike\n\
-         from typing import List, Literal, Optional, Tuple, TypedDict, Union\n\n\
+         from typing import Any, Dict, List, Literal, Optional, Tuple, TypedDict, Union\n\n\
          Path = Union[str, \"PathLike[str]\"]\n",
     );
     let stages = [
@@ -214,45 +220,47 @@ fn fields(config: &impl serde::Serialize) -> Vec<String> {
 
 /// Returns the Python type of an option's value.
 fn python_type(option: &Arg) -> String {
+    let one = single_type(option);
+    match option.get_action() {
+        ArgAction::Append => format!("List[{one}]"),
+        _ => one,
+    }
+}
+
+fn single_type(option: &Arg) -> String {
     if !matches!(option.get_action(), ArgAction::Set | ArgAction::Append) {
         return "bool".to_owned();
     }
     let values = option.get_possible_values();
     if !values.is_empty() {
-        let names: Vec<String> = values
-            .iter()
-            .map(|v| format!("\"{}\"", v.get_name()))
-            .collect();
-        return match names.as_slice() {
-            [a, b] if a == "\"true\"" && b == "\"false\"" => "bool".to_owned(),
-            names => format!("Literal[{}]", names.join(", ")),
-        };
+        let names = values.iter().map(|v| format!("\"{}\"", v.get_name()));
+        return format!("Literal[{}]", names.collect::<Vec<_>>().join(", "));
     }
     let kind = option.get_value_parser().type_id();
-    let is = |kinds: &[TypeId]| kinds.iter().any(|known| kind == *known);
-    let integers = [
-        TypeId::of::<u16>(),
-        TypeId::of::<u32>(),
-        TypeId::of::<u64>(),
-        TypeId::of::<usize>(),
+    let of_rust = [
+        (TypeId::of::<u16>(), "int"),
+        (TypeId::of::<u32>(), "int"),
+        (TypeId::of::<u64>(), "int"),
+        (TypeId::of::<usize>(), "int"),
+        (TypeId::of::<f32>(), "float"),
+        (TypeId::of::<f64>(), "float"),
+        (TypeId::of::<PathBuf>(), "Path"),
+        (TypeId::of::<String>(), "str"),
+        (TypeId::of::<(u32, u32)>(), "Tuple[int, int]"),
     ];
-    let one = if is(&integers) {
-        "int"
-    } else if is(&[TypeId::of::<f32>(), TypeId::of::<f64>()]) {
-        "float"
-    } else if is(&[TypeId::of::<PathBuf>()]) {
-        "Path"
-    } else if is(&[TypeId::of::<String>()]) {
-        "str"
-    } else if is(&[TypeId::of::<(u32, u32)>()]) {
-        "Tuple[int, int]"
-    } else {
-        panic!("{}: add the Python type of this option", option.get_id())
+    let of_rust = of_rust
+        .iter()
+        .find(|known| kind == known.0)
+        .map(|known| known.1);
+    let own = || {
+        OWN_TYPES
+            .iter()
+            .find(|own| option.get_id() == own.0)
+            .map(|own| own.1)
     };
-    match option.get_action() {
-        ArgAction::Append => format!("List[{one}]"),
-        _ => one.to_owned(),
-    }
+    let name = of_rust.or_else(own);
+    name.unwrap_or_else(|| panic!("{}: add its Python type", option.get_id()))
+        .to_owned()
 }
 
 /// Breaks a text into lines of at most `width` characters.
