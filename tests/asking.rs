@@ -75,9 +75,9 @@ fn texts_pixels_and_pictures_find_the_same_object() {
         |args: &[&str]| json(&[&["query", text(&f.scene)], args, &["--view", "008"]].concat());
     let cat = run_query(&[
         "cat",
-        "--export-ply",
+        "--export",
         text(&file("cat.ply")),
-        "--remove-ply",
+        "--export-rest",
         text(&file("rest.ply")),
         "-o",
         text(&file("out")),

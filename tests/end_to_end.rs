@@ -56,7 +56,7 @@ fn the_papers_mapping_and_trained_features_work_too() {
         "--device",
         "cpu",
     ];
-    let mut args = vec!["train", text(&scene), "--init-ply", text(&start)];
+    let mut args = vec!["train", text(&scene), "--init", text(&start)];
     args.extend(options);
     let report = json(&args);
     assert!(
@@ -127,7 +127,7 @@ fn either_feature_mode_refines_the_other() {
         let start = [
             "train",
             text(&scene),
-            "--init-ply",
+            "--init",
             text(&ply_path),
             "--mapping",
             "keep",
@@ -192,7 +192,7 @@ fn either_feature_mode_refines_the_other() {
             "keep",
             "--iterations",
             "0",
-            "--init-ply",
+            "--init",
             text(&ply_path),
         ],
         &["001.png.png", "train it first"],
@@ -335,7 +335,7 @@ fn onnx_exports_of_sam_and_clip() {
     json(&[
         "train",
         text(&scene),
-        "--init-ply",
+        "--init",
         text(&f.scene.join("scene.ply")),
         "--iterations",
         "0",
@@ -624,7 +624,7 @@ fn bad_input_is_reported_and_scenes_stay_unchanged() {
         &[
             "train",
             text(&copy),
-            "--init-ply",
+            "--init",
             text(&at("missing.ply")),
             "--iterations",
             "1",
@@ -660,7 +660,7 @@ fn bad_input_is_reported_and_scenes_stay_unchanged() {
     json(&[
         "train",
         text(&copy),
-        "--init-ply",
+        "--init",
         text(&copy.join("scene.ply")),
         "--iterations",
         "0",

@@ -295,7 +295,7 @@ fn moved_cameras_stay_with_their_gaussians() {
         scene: scene.clone(),
         iterations: Some(100),
         budget: Some(1500),
-        align: train::Align::On,
+        align: train::Switch::On,
         ..Default::default()
     };
     assert!(
@@ -308,7 +308,7 @@ fn moved_cameras_stay_with_their_gaussians() {
     let lifting = train::TrainConfig {
         iterations: Some(0),
         init: Some(scene.join("scene.ply")),
-        align: train::Align::Auto,
+        align: train::Switch::Auto,
         ..moving.clone()
     };
     assert!(
@@ -322,7 +322,7 @@ fn moved_cameras_stay_with_their_gaussians() {
         "objects are lifted with the cameras that the Gaussians were trained with"
     );
     let anew = train::TrainConfig {
-        align: train::Align::Auto,
+        align: train::Switch::Auto,
         ..moving
     };
     let report = fastlgs::train(&anew, &run).expect("a trained scene");

@@ -107,7 +107,7 @@ fn transparent_and_masked_pixels_do_not_count() {
     let again = json(&[
         "train",
         text(&scene),
-        "--init-ply",
+        "--init",
         text(&ply),
         "--iterations",
         "0",

@@ -148,21 +148,13 @@ proptest! {
     }
 
     #[test]
-    fn label_maps_round_trip_and_join(pair in map().prop_flat_map(|a| {
-        let labels = prop::collection::vec(0u16..4, a.labels.len());
-        (Just(a.clone()), labels.prop_map(move |labels| LabelMap { labels, ..a }))
-    })) {
-        let (a, b) = pair;
+    fn label_maps_round_trip(a in map()) {
         let back = round_trip(|p| a.save(&p.with_extension("png")).expect("written"), |p| LabelMap::load(&p.with_extension("png")).expect("read"));
         prop_assert_eq!(&back.labels, &a.labels);
         let (dense, names) = a.dense();
         let undone: Vec<u16> = dense.labels.iter().map(|l| names[usize::from(*l)]).collect();
         prop_assert_eq!(&undone, &a.labels);
         prop_assert!(usize::from(dense.max()) < names.len());
-        let (joint, pairs) = a.joint(&b);
-        for ((j, a), b) in joint.labels.iter().zip(&a.labels).zip(&b.labels) {
-            prop_assert_eq!(pairs[usize::from(*j)], (*a, *b));
-        }
     }
 
     #[test]
@@ -173,8 +165,6 @@ proptest! {
         prop_assert_eq!(metrics::iou(&a, &a), 1.0);
         // IoU never exceeds recall, because both count the same pixels.
         prop_assert!(iou <= metrics::recall(&a, &b) + 1e-12);
-        let not = |m: &[bool]| m.iter().map(|v| !v).collect::<Vec<_>>();
-        prop_assert_eq!(metrics::accuracy(&a, &b), metrics::accuracy(&not(&a), &not(&b)));
         prop_assert_eq!(metrics::boundary_iou(&a, &a, 8, 6, 1), 1.0);
         // The eroded mask lies in the mask, and the mask in the dilated one.
         let (eroded, dilated) = (metrics::erode(&a, 8, 6, 1), metrics::dilate(&a, 8, 6, [1, 1]));

@@ -311,7 +311,7 @@ fn scenes_of_other_programs_get_objects() {
     let report = json(&[
         "train",
         text(&scene),
-        "--init-ply",
+        "--init",
         text(&path),
         "--iterations",
         "0",

@@ -543,7 +543,7 @@ impl Suite<'_> {
             &photos,
             &base,
         )?;
-        const REMAP: [&str; 4] = ["--init-ply", "SCENE/scene.ply", "--iterations", "0"];
+        const REMAP: [&str; 4] = ["--init", "SCENE/scene.ply", "--iterations", "0"];
         let paper = Trial::new(&base, self.work, self.run)?;
         let [_, paper_scored] =
             paper.train_and_eval(&[&REMAP[..], &["--mapping", "paper"]].concat())?;

@@ -31,7 +31,7 @@ pub enum How {
 impl How {
     /// Returns the command and its arguments. SCENE is replaced by the scene folder.
     pub fn command(&self) -> Vec<&'static str> {
-        const START: [&str; 3] = ["SCENE", "--init-ply", "SCENE/scene.ply"];
+        const START: [&str; 3] = ["SCENE", "--init", "SCENE/scene.ply"];
         match self {
             Self::Remap(args) => [&["train"], &START[..], &["--iterations", "0"], args].concat(),
             Self::Descent(steps) => {

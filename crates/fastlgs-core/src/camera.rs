@@ -1,5 +1,6 @@
 //! Pinhole cameras, and the extent and up direction of a set of cameras.
 
+use crate::stats;
 use crate::{Error, Result, WorldFrame, fs, world_frame};
 use glam::{DMat4, Mat4, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
@@ -209,15 +210,10 @@ const OUTLIER_DISTANCE: f32 = 10.0;
 /// Marks the cameras that lie far outside the others; their poses are most often wrong. Uses
 /// medians, so that outliers do not shift the reference.
 pub fn outlier_cameras(cameras: &[Camera]) -> Vec<bool> {
-    let centres: Vec<Vec3> = cameras.iter().map(Camera::centre).collect();
-    let median = |mut values: Vec<f32>| {
-        values.sort_by(f32::total_cmp);
-        values.get(values.len() / 2).copied().unwrap_or(0.0)
-    };
-    let middle =
-        Vec3::from_array([0, 1, 2].map(|k| median(centres.iter().map(|c| c[k]).collect())));
-    let distances: Vec<f32> = centres.iter().map(|c| c.distance(middle)).collect();
-    let median_distance = median(distances.clone());
+    let centres = cameras.iter().map(Camera::centre);
+    let middle = stats::median_position(centres.clone());
+    let distances: Vec<f32> = centres.map(|c| c.distance(middle)).collect();
+    let median_distance = stats::median(distances.iter().copied()).unwrap_or(0.0);
     // If most cameras share one position, the median distance is 0 and gives no scale.
     distances
         .iter()

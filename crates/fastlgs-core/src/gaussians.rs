@@ -1,5 +1,6 @@
 //! The Gaussians of a scene as a structure of arrays.
 
+use crate::stats;
 use glam::{Quat, Vec3};
 
 /// Zeroth spherical-harmonic basis function, 1 / (2 sqrt(pi)).
@@ -321,14 +322,9 @@ impl Gaussians {
     /// Removes Gaussians far outside the scene, which would waste the range of quantised formats.
     /// Returns the rest and the number of removed ones.
     pub fn without_far_outliers(&self) -> (Self, usize) {
-        let median = |mut values: Vec<f32>| {
-            values.sort_by(f32::total_cmp);
-            values.get(values.len() / 2).copied().unwrap_or(0.0)
-        };
-        let middle =
-            Vec3::from_array([0, 1, 2].map(|k| median(self.means.iter().map(|m| m[k]).collect())));
+        let middle = stats::median_position(self.means.iter().copied());
         let distances: Vec<f32> = self.means.iter().map(|m| m.distance(middle)).collect();
-        let most = OUTLIER_DISTANCE * median(distances.clone());
+        let most = OUTLIER_DISTANCE * stats::median(distances.iter().copied()).unwrap_or(0.0);
         let kept: Vec<usize> = (0..self.len())
             .filter(|i| most == 0.0 || distances[*i] <= most)
             .collect();

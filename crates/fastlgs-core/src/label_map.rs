@@ -97,37 +97,6 @@ impl LabelMap {
     ///
     /// # Panics
     /// If the maps differ in size.
-    pub fn joint(&self, other: &Self) -> (Self, Vec<(u16, u16)>) {
-        assert_eq!(
-            (self.width, self.height),
-            (other.width, other.height),
-            "both maps must have the same size"
-        );
-        let ((own, names), (theirs, their_names)) = (self.dense(), other.dense());
-        let pair_index =
-            |(a, b): (&u16, &u16)| usize::from(*a) * their_names.len() + usize::from(*b);
-        let mut number = vec![None; names.len() * their_names.len()];
-        own.labels
-            .iter()
-            .zip(&theirs.labels)
-            .for_each(|pair| number[pair_index(pair)] = Some(0));
-        let mut pairs = Vec::new();
-        for (place, number) in number.iter_mut().enumerate().filter(|n| n.1.is_some()) {
-            *number = Some(pairs.len() as u16);
-            pairs.push((
-                names[place / their_names.len()],
-                their_names[place % their_names.len()],
-            ));
-        }
-        let labels = own
-            .labels
-            .iter()
-            .zip(&theirs.labels)
-            .map(|pair| number[pair_index(pair)].unwrap_or(0))
-            .collect();
-        (Self { labels, ..*self }, pairs)
-    }
-
     /// Resizes the map with nearest-neighbour sampling.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let pick = |n: u32, from: u32, to: u32| {
@@ -373,20 +342,6 @@ mod tests {
                 .unwrap_err()
                 .to_string()
                 .contains("tracked.png")
-        );
-    }
-
-    #[test]
-    fn pairs_of_labels() {
-        let map = |labels: &[u16]| LabelMap {
-            width: 3,
-            height: 2,
-            labels: labels.to_vec(),
-        };
-        let (joint, pairs) = map(&[9, 9, 0, 9, 4, 4]).joint(&map(&[1, 2, 2, 1, 2, 2]));
-        assert_eq!(
-            (joint.labels, pairs),
-            (vec![2, 3, 0, 2, 1, 1], vec![(0, 2), (4, 2), (9, 1), (9, 2)])
         );
     }
 

@@ -36,6 +36,7 @@ pub mod sog;
 pub mod splat;
 pub mod splat_file;
 pub mod spz;
+pub mod stats;
 pub mod turbo;
 pub mod undistort;
 pub mod world_frame;

@@ -25,12 +25,6 @@ pub fn recall(found: &[bool], truth: &[bool]) -> f64 {
     }
 }
 
-/// Returns the share of all pixels on which two masks agree.
-pub fn accuracy(found: &[bool], truth: &[bool]) -> f64 {
-    let same = found.iter().zip(truth).filter(|(f, t)| f == t).count();
-    same as f64 / truth.len().max(1) as f64
-}
-
 /// Returns the boundary IoU (Cheng et al. 2021): the IoU of the bands within `distance` pixels
 /// inside each mask's border.
 pub fn boundary_iou(a: &[bool], b: &[bool], width: u32, height: u32, distance: u32) -> f64 {
@@ -250,7 +244,6 @@ mod tests {
         let b = [true, false, true, false];
         assert!((iou(&a, &b) - 1.0 / 3.0).abs() < 1e-12);
         assert!((recall(&a, &b) - 0.5).abs() < 1e-12);
-        assert!((accuracy(&a, &b) - 0.5).abs() < 1e-12);
         assert_eq!(iou(&[false; 3], &[false; 3]), 1.0);
         assert!((auroc(&[0.9, 0.4], &[0.1, 0.4]) - 0.875).abs() < 1e-12);
     }

@@ -5,6 +5,7 @@
 //! 1994).
 
 use fastlgs_core::mask_list::Atoms;
+use fastlgs_core::stats;
 use fastlgs_core::{Camera, LabelMap};
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
@@ -196,9 +197,7 @@ fn is_in_hull(views: &[Outline], own: usize, place: Vec3, min_views: usize) -> b
 /// Keeps one point in each cell of the median spacing, and groups cells that are at most
 /// [`MAX_CELL_DISTANCE`] cells apart.
 fn group_points(found: &[(Vec3, f32)]) -> Vec<Hull> {
-    let mut spacings: Vec<f32> = found.iter().map(|(_, spacing)| *spacing).collect();
-    spacings.sort_by(f32::total_cmp);
-    let Some(spacing) = spacings.get(spacings.len() / 2).copied() else {
+    let Some(spacing) = stats::median(found.iter().map(|(_, spacing)| *spacing)) else {
         return Vec::new();
     };
     let mut cells: BTreeMap<[i32; 3], Vec3> = BTreeMap::new();

@@ -10,6 +10,7 @@ use crate::engine::{Engine, Exposure};
 use crate::target::Target;
 use crate::view::View;
 use fastlgs_core::Camera;
+use fastlgs_core::stats;
 use glam::{Mat4, Quat, Vec3};
 use nalgebra::{SMatrix, SVector};
 
@@ -187,19 +188,11 @@ fn residuals_of(
 /// Returns the median depth of the pixels whose transmittance is below 0.5; `None` if there are
 /// none.
 fn median_depth(engine: &mut dyn Engine, view: View) -> Result<Option<f32>> {
-    let frame = engine.render(
-        View {
-            depth_as_feature: 1,
-            ..view
-        },
-        Channels::Feature,
-    )?;
+    let frame = engine.render(view.with_depth_as_feature(), Channels::Feature)?;
     let solid = frame
         .channels(3, 4)
         .iter()
         .zip(frame.transmittance())
         .filter(|(_, t)| **t < 0.5);
-    let mut depths: Vec<f32> = solid.map(|(z, t)| z / (1.0 - t)).collect();
-    depths.sort_by(f32::total_cmp);
-    Ok(depths.get(depths.len() / 2).copied())
+    Ok(stats::median(solid.map(|(z, t)| z / (1.0 - t))))
 }

@@ -32,8 +32,6 @@ pub struct DensityConfig {
     pub split_scale: f32,
     /// Opacity below which a Gaussian is removed.
     pub min_opacity: f32,
-    /// Largest scale, as a share of the scene extent, beyond which a Gaussian is removed.
-    pub largest: f32,
     /// Largest number of Gaussians.
     pub budget: usize,
 }
@@ -44,7 +42,6 @@ impl Default for DensityConfig {
             gradient: 2e-4,
             split_scale: 0.01,
             min_opacity: 0.005,
-            largest: f32::INFINITY,
             budget: 60_000,
         }
     }
@@ -207,11 +204,7 @@ pub fn refine(
     rng: &mut Rng,
 ) -> Counts {
     let n = state.len();
-    let keeps = |i: usize| {
-        state.is_finite(i)
-            && state.opacity(i) >= config.min_opacity
-            && state.largest_scale(i) <= config.largest * extent
-    };
+    let keeps = |i: usize| state.is_finite(i) && state.opacity(i) >= config.min_opacity;
     let keep: Vec<bool> = (0..n).map(keeps).collect();
     let kept = keep.iter().filter(|k| **k).count();
     let mut counts = Counts {

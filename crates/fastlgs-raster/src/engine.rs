@@ -79,6 +79,21 @@ impl Frame {
         self.channels(7, 8)
     }
 
+    /// Returns the expected depth of each pixel of a view with the depth as feature
+    /// ([`View::with_depth_as_feature`]), in units of the scene: sum of w z / sum of w, with blending
+    /// weights w. Pixels with a transmittance of `empty` or more are infinite.
+    pub fn depth(&self, empty: f32) -> Vec<f32> {
+        let pixels = self.channels(3, 4).iter().zip(self.transmittance());
+        let of_pixel = |(z, t): (&f32, &f32)| {
+            if *t < empty {
+                z / (1.0 - t)
+            } else {
+                f32::INFINITY
+            }
+        };
+        pixels.map(of_pixel).collect()
+    }
+
     /// Returns the channels `from..to` as one planar slice.
     pub fn channels(&self, from: usize, to: usize) -> &[f32] {
         let n = (self.width * self.height) as usize;

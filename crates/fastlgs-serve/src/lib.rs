@@ -197,11 +197,6 @@ fn subject_distance(means: &[Vec3], camera: &Camera) -> f32 {
         let near = |v: f32, size: u32| (v / size as f32 - 0.5).abs() < 0.2;
         (p.z > 0.0 && near(pixel.x, camera.width) && near(pixel.y, camera.height)).then_some(p.z)
     };
-    let mut depths: Vec<f32> = means
-        .iter()
-        .step_by(means.len().div_ceil(SAMPLES).max(1))
-        .filter_map(middle)
-        .collect();
-    depths.sort_by(f32::total_cmp);
-    depths.get(depths.len() / 2).copied().unwrap_or(1.0)
+    let samples = means.iter().step_by(means.len().div_ceil(SAMPLES).max(1));
+    fastlgs_core::stats::median(samples.filter_map(middle)).unwrap_or(1.0)
 }

@@ -5,7 +5,8 @@
 use crate::similarity::Similarity;
 use fastlgs_core::Camera;
 use fastlgs_core::rng::Rng;
-use glam::{Mat4, Quat, Vec3};
+use fastlgs_core::stats;
+use glam::{Mat4, Quat};
 use std::collections::BTreeSet;
 
 /// Number of random samples of three cameras each (RANSAC).
@@ -99,25 +100,16 @@ pub fn align(
 /// Returns the median distance of the cameras from their median position, which is robust to
 /// outliers.
 fn spread(cameras: &[Camera]) -> f32 {
-    let median = |mut values: Vec<f32>| {
-        values.sort_by(f32::total_cmp);
-        values[values.len() / 2]
-    };
-    let middle = Vec3::from_array(
-        [0, 1, 2].map(|k| median(cameras.iter().map(|c| c.centre()[k]).collect())),
-    );
-    median(
-        cameras
-            .iter()
-            .map(|c| c.centre().distance(middle))
-            .collect(),
-    )
+    let centres = cameras.iter().map(Camera::centre);
+    let middle = stats::median_position(centres.clone());
+    stats::median(centres.map(|centre| centre.distance(middle))).unwrap_or(0.0)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use glam::Mat3;
+    use glam::Vec3;
 
     #[test]
     fn align_finds_the_frame_of_the_correct_poses() {

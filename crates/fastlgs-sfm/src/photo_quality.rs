@@ -1,5 +1,6 @@
 //! Finds blurred photos and photos that repeat the one before them.
 
+use fastlgs_core::stats;
 use image::imageops::{FilterType, grayscale, resize};
 use image::{GrayImage, RgbImage};
 
@@ -54,9 +55,8 @@ impl PhotoStats {
 
 /// Returns the sharpness of each photo, relative to the median.
 fn relative(photos: &[PhotoStats]) -> impl Iterator<Item = f32> {
-    let mut all: Vec<f32> = photos.iter().map(|p| p.sharpness).collect();
-    all.sort_by(f32::total_cmp);
-    let middle = all.get(all.len() / 2).copied().unwrap_or(0.0).max(1e-12);
+    let median = stats::median(photos.iter().map(|p| p.sharpness));
+    let middle = median.unwrap_or(0.0).max(1e-12);
     photos.iter().map(move |p| p.sharpness / middle)
 }
 

@@ -6,6 +6,7 @@ use crate::matching::matches;
 use crate::photo_quality::PhotoStats;
 use crate::process_output::lines;
 use crate::{Error, Result};
+use fastlgs_core::stats;
 use image::GrayImage;
 use serde::Deserialize;
 use std::collections::VecDeque;
@@ -359,10 +360,7 @@ impl FrameSelector {
         let Some((number, sharpness, frame)) = sharpest else {
             return Ok(());
         };
-        let mut before: Vec<f32> = self.sharpness.iter().copied().collect();
-        before.sort_by(f32::total_cmp);
-        if before
-            .get(before.len() / 2)
+        if stats::median(self.sharpness.iter().copied())
             .is_some_and(|usual| sharpness < BLURRED * usual)
             && self.blurred < MAX_BLURRED_RUN
         {

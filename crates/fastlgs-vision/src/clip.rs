@@ -172,10 +172,6 @@ impl ClipImage {
 }
 
 impl Encoder for ClipImage {
-    fn name(&self) -> &'static str {
-        "clip"
-    }
-
     fn embed_masks(
         &self,
         _view: &str,

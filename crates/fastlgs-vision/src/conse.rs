@@ -206,10 +206,6 @@ impl Conse {
 }
 
 impl Encoder for Conse {
-    fn name(&self) -> &'static str {
-        "offline"
-    }
-
     fn embed_masks(
         &self,
         _view: &str,

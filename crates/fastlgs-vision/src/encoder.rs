@@ -6,8 +6,6 @@ use image::RgbImage;
 
 /// Embeds the masks of a photo.
 pub trait Encoder: Sync {
-    /// Name recorded in the scene; a query must use the text tower of the same encoder.
-    fn name(&self) -> &'static str;
     /// Returns one embedding for each label 1..=max of a view's label map, in order; zeros for
     /// labels that do not occur. The values that are compared with texts have length 1. Values that
     /// are compared only with other masks may follow ([`crate::appearance`]).

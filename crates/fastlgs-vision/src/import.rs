@@ -451,10 +451,6 @@ fn pictures(folder: &Path) -> Result<MaskList> {
 }
 
 impl Segmenter for Import {
-    fn name(&self) -> &'static str {
-        "import"
-    }
-
     fn segment(&self, view: &str, photo: &RgbImage) -> Result<MaskList> {
         Ok(self
             .load_prepared(view, photo.width(), photo.height())?
@@ -463,10 +459,6 @@ impl Segmenter for Import {
 }
 
 impl Encoder for Import {
-    fn name(&self) -> &'static str {
-        "import"
-    }
-
     /// Returns the imported embedding of the mask that fits each label best; zeros if none fits.
     fn embed_masks(&self, view: &str, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
         let missing = || {

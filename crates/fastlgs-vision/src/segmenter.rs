@@ -14,8 +14,6 @@ pub const VERSION: u32 = 1;
 
 /// Finds masks in photos.
 pub trait Segmenter: Sync {
-    /// Returns the name that the scene records.
-    fn name(&self) -> &'static str;
     /// Returns the masks of a photo, in the photo's size. `view` is the name of its view.
     ///
     /// # Errors
@@ -109,10 +107,6 @@ fn at_side(photo: &RgbImage, side: u32) -> RgbImage {
 }
 
 impl Segmenter for OfflineSegmenter {
-    fn name(&self) -> &'static str {
-        "offline"
-    }
-
     fn segment(&self, _view: &str, photo: &RgbImage) -> Result<MaskList> {
         let photo = &brighten::brightened(photo);
         let small = at_side(photo, WORK_SIDE.min(photo.width().max(photo.height())));

@@ -515,10 +515,6 @@ impl ImportedEmbeddings {
 }
 
 impl Encoder for ImportedEmbeddings {
-    fn name(&self) -> &'static str {
-        "import"
-    }
-
     fn embed_masks(
         &self,
         view: &str,

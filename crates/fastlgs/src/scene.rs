@@ -223,19 +223,7 @@ impl Scene {
     pub fn render_depth(&mut self, camera: &Camera) -> Result<Vec<f32>> {
         let view = self.view(camera).with_depth_as_feature();
         let frame = self.engine.render(view, Channels::Feature)?;
-        let solid = |(z, t): (&f32, &f32)| {
-            if *t < 0.999 {
-                z / (1.0 - t)
-            } else {
-                f32::INFINITY
-            }
-        };
-        Ok(frame
-            .channels(3, 4)
-            .iter()
-            .zip(frame.transmittance())
-            .map(solid)
-            .collect())
+        Ok(frame.depth(0.999))
     }
 
     /// Renders the object data of a view: id weights if features are lifted, codes if they are

@@ -206,19 +206,7 @@ fn depth(
         .with_antialias(antialias)
         .with_depth_as_feature();
     let frame = engine.render(view, Channels::Feature)?;
-    let of_pixel = |(z, through): (&f32, &f32)| {
-        if *through < EMPTY_TRANSMITTANCE {
-            z / (1.0 - through)
-        } else {
-            f32::INFINITY
-        }
-    };
-    Ok(frame
-        .channels(3, 4)
-        .iter()
-        .zip(frame.transmittance())
-        .map(of_pixel)
-        .collect())
+    Ok(frame.depth(EMPTY_TRANSMITTANCE))
 }
 
 /// Adds the transparent Gaussians of a hull to a scene, and returns their indices.

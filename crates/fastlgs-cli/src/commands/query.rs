@@ -83,10 +83,10 @@ pub struct Args {
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     dilate_times: u32,
     /// Write the Gaussians of the answer to FILE.ply, FILE.spz, FILE.sog or FILE.glb.
-    #[arg(long, value_name = "FILE", alias = "export-ply")]
+    #[arg(long, value_name = "FILE")]
     export: Option<PathBuf>,
     /// Write all other Gaussians to FILE, in the same formats.
-    #[arg(long, value_name = "FILE", alias = "remove-ply")]
+    #[arg(long, value_name = "FILE")]
     export_rest: Option<PathBuf>,
 }
 

@@ -89,14 +89,6 @@ impl MaskList {
 
     /// Creates the list of the masks in three label maps of one size, one for each level, coarse to
     /// fine.
-    pub fn from_levels(levels: &[LabelMap; 3]) -> Self {
-        let mut list = Self::new(levels[0].width, levels[0].height);
-        for (level, map) in Level::ALL.into_iter().zip(levels) {
-            list.add(level, map);
-        }
-        list
-    }
-
     /// Appends the masks of a label map in ascending order of their labels. Returns these labels.
     pub fn add(&mut self, level: Level, map: &LabelMap) -> Vec<u16> {
         let boxes = map.boxes();
@@ -210,16 +202,14 @@ mod tests {
 
     #[test]
     fn label_maps_become_lists() {
-        let list = MaskList::from_levels(&[map(&[9, 9, 3, 3]), map(&[0; 4]), map(&[5, 0, 0, 0])]);
+        let mut list = MaskList::new(4, 1);
+        assert_eq!(list.add(Level::Whole, &map(&[9, 9, 3, 3])), [3, 9]);
+        list.add(Level::Subpart, &map(&[5, 0, 0, 0]));
         let levels: Vec<Level> = list.masks.iter().map(|m| m.level).collect();
         assert_eq!(levels, [Level::Whole, Level::Whole, Level::Subpart]);
         assert_eq!(
             list.pixel_indices(&list.masks[0]).collect::<Vec<_>>(),
             [2, 3]
-        );
-        assert_eq!(
-            MaskList::new(4, 1).add(Level::Whole, &map(&[9, 9, 3, 3])),
-            [3, 9]
         );
     }
 }

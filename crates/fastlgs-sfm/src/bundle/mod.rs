@@ -10,6 +10,7 @@ use crate::keypoints::Keypoints;
 use crate::similarity::Similarity;
 use crate::tracks::{PairMatches, TOLERANCE, Track, tracks};
 use fastlgs_core::Camera;
+use fastlgs_core::stats;
 use fastlgs_core::undistort::Distortion;
 use glam::Vec3;
 use problem::{Lens, Observation, Pose, Problem, Values};
@@ -198,10 +199,7 @@ fn movements(given: &[Camera], cameras: &[Camera], tracks: &[Track]) -> Vec<f32>
             distances[view].push(at(&given[view]).distance(at(&cameras[view])));
         }
     }
-    let median = |mut all: Vec<f32>| {
-        all.sort_by(f32::total_cmp);
-        all.get(all.len() / 2).copied().unwrap_or(0.0)
-    };
+    let median = |distances: Vec<f32>| stats::median(distances).unwrap_or(0.0);
     distances.into_iter().map(median).collect()
 }
 

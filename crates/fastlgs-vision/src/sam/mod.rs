@@ -123,10 +123,6 @@ impl Sam {
 }
 
 impl Segmenter for Sam {
-    fn name(&self) -> &'static str {
-        "sam"
-    }
-
     fn segment(&self, view: &str, photo: &RgbImage) -> Result<MaskList> {
         let (width, height) = photo.dimensions();
         let least = (SPECK * (width * height) as f32) as usize;

@@ -37,32 +37,29 @@ impl Preset {
     }
 }
 
-/// Whether training learns an affine exposure for each training photo.
+/// Whether a step runs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
-pub enum Exposures {
-    /// Learn exposures if the photos' brightness varies.
+pub enum Switch {
+    /// It runs if it helps; the option describes how this is decided.
     #[default]
     Auto,
-    /// Learn exposures.
+    /// It runs.
     On,
-    /// Do not learn exposures.
+    /// It does not run.
     Off,
 }
 
-/// Whether training refines the cameras of the training photos.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
-pub enum Align {
-    /// Refine the cameras if validation views improve by it.
-    #[default]
-    Auto,
-    /// Refine the cameras.
-    On,
-    /// Keep the cameras.
-    Off,
+impl Switch {
+    /// Returns whether the step runs, if `Auto` means `automatic`.
+    pub(crate) fn is_on(self, automatic: bool) -> bool {
+        match self {
+            Self::Auto => automatic,
+            Self::On => true,
+            Self::Off => false,
+        }
+    }
 }
 
 /// How masks become objects.
@@ -78,21 +75,6 @@ pub enum Mapping {
     /// Keep the objects of a trained scene. With --init of its scene.ply, either feature mode
     /// refines the result of the other.
     Keep,
-}
-
-/// Whether masks guide training at the borders of objects.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
-pub enum Borders {
-    /// Use masks of SAM and imported masks. Masks of the offline segmenter only follow edges of the
-    /// photos and are not used.
-    #[default]
-    Auto,
-    /// Use masks.
-    On,
-    /// Do not use masks.
-    Off,
 }
 
 /// How Gaussians get their codes.
@@ -222,26 +204,24 @@ pub struct TrainConfig {
     /// black; if --init names the Gaussians of this scene, the background of their training.
     #[cfg_attr(feature = "clap", arg(long, value_parser = Background::parse))]
     pub background: Option<Background>,
-    /// Learn an affine exposure for each training photo.
+    /// Learn an affine exposure for each training photo. `auto` does so if the photos' brightness
+    /// varies.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t, num_args = 0..=1, default_missing_value = "on", require_equals = true))]
-    pub exposure: Exposures,
+    pub exposure: Switch,
     /// Refine the cameras of the training photos. `auto` does so if validation views improve by it.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
-    pub align: Align,
-    /// Use masks to train Gaussians to end at the borders of objects. Needs --mapping global and
-    /// --feature-mode lift.
+    pub align: Switch,
+    /// Use masks to train Gaussians to end at the borders of objects. `auto` uses masks of SAM and
+    /// imported ones; those of the offline segmenter only follow edges of the photos. Needs
+    /// --mapping global and --feature-mode lift.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
-    pub borders: Borders,
+    pub borders: Switch,
     /// Keep geometry and colour of the --init file, and train features only.
     #[cfg_attr(feature = "clap", arg(long, requires = "init"))]
     pub freeze: bool,
     /// Start from the Gaussians of a file instead of points: .ply (including compressed files of
     /// SuperSplat), .spz, .sog, .glb or .splat.
-    #[cfg_attr(
-        feature = "clap",
-        arg(long, value_name = "FILE", visible_alias = "init-ply")
-    )]
-    #[serde(alias = "init_ply")]
+    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
     pub init: Option<PathBuf>,
     /// How masks become objects.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
@@ -298,9 +278,9 @@ impl Default for TrainConfig {
             sh_degree: None,
             antialias: false,
             background: None,
-            exposure: Exposures::default(),
-            align: Align::default(),
-            borders: Borders::default(),
+            exposure: Switch::default(),
+            align: Switch::default(),
+            borders: Switch::default(),
             freeze: false,
             init: None,
             mapping: Mapping::default(),
@@ -374,12 +354,8 @@ impl TrainConfig {
 
     /// Returns whether masks guide training. `segmenter` is its name in the manifest.
     pub(super) fn masks_guide_training(&self, segmenter: &str) -> bool {
-        let asked = match self.borders {
-            Borders::Auto => segmenter != SegmenterKind::Offline.name(),
-            Borders::On => true,
-            Borders::Off => false,
-        };
-        asked
+        self.borders
+            .is_on(segmenter != SegmenterKind::Offline.name())
             && self.mapping == Mapping::Global
             && self.feature_mode == FeatureMode::Lift
             && !self.freeze

@@ -13,9 +13,7 @@ use crate::error::Context;
 use crate::output::SceneLock;
 use crate::staged::StagedOutput;
 use crate::{Error, Result, Run, SceneNotes, checkpoints, objects, transparent};
-pub use config::{
-    Align, Background, Borders, Cue, Exposures, FeatureMode, Mapping, Preset, TrainConfig,
-};
+pub use config::{Background, Cue, FeatureMode, Mapping, Preset, Switch, TrainConfig};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, SceneFolder, ply};
 use fastlgs_grid::Grid;

@@ -1,6 +1,6 @@
 //! Translates options into the trainer's configuration.
 
-use super::config::{Align, Exposures, FeatureMode, TrainConfig};
+use super::config::{FeatureMode, Switch, TrainConfig};
 use super::mask_supervision;
 use crate::preprocess::Brightness;
 use fastlgs_core::Gaussians;
@@ -44,15 +44,13 @@ pub fn settings(
         antialias: config.antialias,
         background: background.color,
         learn_background: background.learn,
-        exposure: match config.exposure {
-            Exposures::Auto => brightness.spread_stops >= MIN_BRIGHTNESS_SPREAD,
-            Exposures::On => true,
-            Exposures::Off => false,
-        },
+        exposure: config
+            .exposure
+            .is_on(brightness.spread_stops >= MIN_BRIGHTNESS_SPREAD),
         alignment: match config.align {
-            Align::Auto => Alignment::Auto,
-            Align::On => Alignment::On,
-            Align::Off => Alignment::Off,
+            Switch::Auto => Alignment::Auto,
+            Switch::On => Alignment::On,
+            Switch::Off => Alignment::Off,
         },
         ..TrainerConfig::default()
     }
