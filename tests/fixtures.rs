@@ -1,5 +1,6 @@
 //! Readers of files that other programs wrote; `tests/fixtures/README.md` names the programs.
 
+use fastlgs_core::mask_list::annotations;
 use fastlgs_core::{Gaussians, WorldFrame, dataset, image_io, splat_file};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
@@ -132,6 +133,27 @@ fn quantised_formats_of_splat_transform() {
         "splats/helix.sog",
     ] {
         assert_helix(name, &coarse);
+    }
+}
+
+#[test]
+fn masks_of_pycocotools() {
+    let list = annotations::load(&fixture("coco/masks.json"), Some("photo.png"), None)
+        .expect("the masks")
+        .expect("masks of this photo");
+    assert_eq!((list.width, list.height), (50, 36));
+    let squared =
+        |x: i32, y: i32, centre: (i32, i32)| (x - centre.0).pow(2) + (y - centre.1).pow(2);
+    let shapes: [&dyn Fn(i32, i32) -> bool; 3] = [
+        &|x, y| squared(x, y, (20, 15)) < 100,
+        &|x, y| (64..196).contains(&squared(x, y, (34, 20))),
+        &|_, y| y == 35,
+    ];
+    assert_eq!(list.masks.len(), 3);
+    for (mask, shape) in list.masks.iter().zip(shapes) {
+        let expected = (0..36 * 50).filter(|p| shape(*p % 50, *p / 50));
+        let expected: Vec<usize> = expected.map(|p| p as usize).collect();
+        assert_eq!(list.pixel_indices(mask).collect::<Vec<_>>(), expected);
     }
 }
 

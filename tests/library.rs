@@ -3,6 +3,9 @@
 //! Needs the offline models. Without them the tests are skipped with a message, or fail if
 //! FASTLGS_REQUIRE_MODELS is set.
 
+#[path = "support/skip.rs"]
+mod skip;
+
 use fastlgs::progress::{Message, Sink};
 use fastlgs::{Error, Run, Scene, preprocess, synth, train};
 use fastlgs_core::rng::Rng;
@@ -50,7 +53,7 @@ fn models_are_there() -> bool {
         "the offline models are missing"
     );
     if !installed {
-        eprintln!("SKIPPED: needs the offline models");
+        skip::skip("needs the offline models");
     }
     installed
 }

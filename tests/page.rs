@@ -98,7 +98,7 @@ fn chromium() -> bool {
             std::env::var_os("FASTLGS_REQUIRE_GPU").is_none(),
             "chromium and chromedriver are missing"
         );
-        eprintln!("SKIPPED: needs chromium and chromedriver");
+        run::skip("needs chromium and chromedriver");
     }
     there
 }
@@ -698,7 +698,7 @@ fn an_exported_page_answers_on_a_static_server() {
 fn the_fox_is_highlighted_in_the_browser() {
     let photos = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/fox");
     if !photos.is_dir() {
-        eprintln!("SKIPPED: {} is not there", photos.display());
+        run::skip(format_args!("{} is not there", photos.display()));
         return;
     }
     if !chromium() || !run::requirements_met() {

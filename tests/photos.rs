@@ -464,7 +464,7 @@ fn all_poses_are_recomputed_if_many_are_wrong() {
     let Some(dir) = scene_dir() else { return };
     let fox = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/fox");
     if !fox.is_dir() {
-        println!("SKIPPED: {} is absent", fox.display());
+        run::skip(format_args!("{} is absent", fox.display()));
         return;
     }
     let (photos, exact, scene) = (
@@ -593,7 +593,7 @@ fn videos_become_photos() {
             std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(),
             "ffmpeg is missing"
         );
-        eprintln!("SKIPPED: ffmpeg is missing");
+        run::skip("ffmpeg is missing");
         return;
     }
     let dir = tempfile::tempdir().expect("a temporary folder");

@@ -453,7 +453,7 @@ fn other_programs() -> Option<PathBuf> {
             std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(),
             "npm is missing; run ./setup.sh --tests to install it"
         );
-        eprintln!("SKIPPED: npm is not installed; it installs the programs that read our exports");
+        run::skip("npm is not installed; it installs the programs that read our exports");
         return None;
     }
     let bin = root.join("node_modules");
@@ -651,7 +651,7 @@ fn examples_run() {
                 "{} is missing; run 'cargo build --release --examples'",
                 program.display()
             );
-            eprintln!("SKIPPED: {} is not built", program.display());
+            run::skip(format_args!("{} is not built", program.display()));
             return String::new();
         }
         let output = Command::new(program)
@@ -730,7 +730,7 @@ fn examples_run() {
 #[test]
 fn snakemake_runs_the_workflow_on_two_scenes() {
     let Some(snakemake) = std::env::var_os("FASTLGS_SNAKEMAKE") else {
-        eprintln!("SKIPPED: FASTLGS_SNAKEMAKE is not set to the path of snakemake");
+        run::skip("FASTLGS_SNAKEMAKE is not set to the path of snakemake");
         return;
     };
     if !run::requirements_met() {

@@ -2,9 +2,13 @@
 // Not every test program uses all functions.
 #![allow(dead_code)]
 
+#[path = "skip.rs"]
+mod skip;
+
 use fastlgs_core::label_map::LabelMap;
 use fastlgs_core::metrics;
 use serde_json::Value;
+pub use skip::skip;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
@@ -204,7 +208,9 @@ pub fn requirements_met() -> bool {
             std::env::var_os("FASTLGS_REQUIRE_GPU").is_none(),
             "models or device are missing: {ready}"
         );
-        eprintln!("SKIPPED: needs the offline models and a Vulkan device: {ready}");
+        skip(format_args!(
+            "needs the offline models and a Vulkan device: {ready}"
+        ));
     }
     complete
 }

@@ -36,6 +36,9 @@ mod trainer;
 mod view;
 
 #[cfg(test)]
+#[path = "../../../tests/support/skip.rs"]
+mod skip;
+#[cfg(test)]
 mod tests;
 
 pub use channels::Channels;

@@ -269,7 +269,7 @@ mod tests {
             image::imageops::grayscale(&fastlgs_core::image_io::resize(&photo, 270, 480))
         };
         if !images.is_dir() {
-            eprintln!("SKIPPED: {} does not exist", images.display());
+            crate::skip::skip(format_args!("{} does not exist", images.display()));
             return;
         }
         let (a, b) = (photo("0001.jpg"), photo("0002.jpg"));

@@ -18,6 +18,9 @@ pub mod resection;
 #[cfg(test)]
 mod ring;
 pub mod similarity;
+#[cfg(all(test, feature = "opencv", feature = "rust-sift"))]
+#[path = "../../../tests/support/skip.rs"]
+mod skip;
 pub mod structure;
 pub mod sweep;
 pub mod tracks;

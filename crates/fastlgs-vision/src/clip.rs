@@ -337,8 +337,8 @@ mod tests {
     use image::Rgb;
 
     fn has_runtime() -> bool {
-        let found =
-            crate::model_paths::runtime_library().inspect_err(|e| eprintln!("SKIPPED: {e}"));
+        let found = crate::model_paths::runtime_library()
+            .inspect_err(|e| crate::skip::skip(format_args!("{e}")));
         assert!(
             found.is_ok() || std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(),
             "FASTLGS_REQUIRE_MODELS is set, but ONNX Runtime is missing"

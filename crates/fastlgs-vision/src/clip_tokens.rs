@@ -271,7 +271,7 @@ mod tests {
             Ok(tokens) => Some(tokens),
             Err(e) if std::env::var_os("FASTLGS_REQUIRE_MODELS").is_some() => panic!("{e}"),
             Err(e) => {
-                eprintln!("SKIPPED: {e}");
+                crate::skip::skip(format_args!("{e}"));
                 None
             }
         }

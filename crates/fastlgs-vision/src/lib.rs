@@ -32,6 +32,9 @@ pub mod text;
 #[path = "../../../tests/support/onnx.rs"]
 mod onnx;
 #[cfg(test)]
+#[path = "../../../tests/support/skip.rs"]
+mod skip;
+#[cfg(test)]
 #[path = "../../../tests/support/toy_models.rs"]
 mod toy_models;
 

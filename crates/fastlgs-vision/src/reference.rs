@@ -12,16 +12,14 @@ use std::path::{Path, PathBuf};
 /// Returns the folder of one architecture; `None` if its files were not made.
 fn folder(which: &str) -> Option<PathBuf> {
     let Some(all) = std::env::var_os("FASTLGS_REFERENCE") else {
-        eprintln!(
-            "SKIPPED: FASTLGS_REFERENCE does not name the folder that tests/reference.sh writes"
+        crate::skip::skip(
+            "FASTLGS_REFERENCE does not name the folder that tests/reference.sh writes",
         );
         return None;
     };
     let folder = Path::new(&all).join(which);
     if which == "sam2" && !folder.is_dir() {
-        eprintln!(
-            "SKIPPED: the SAM 2 files are missing; set REFERENCE_SAM2 for tests/reference.sh"
-        );
+        crate::skip::skip("the SAM 2 files are missing; set REFERENCE_SAM2 for tests/reference.sh");
         return None;
     }
     Some(folder)

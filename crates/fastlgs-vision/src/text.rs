@@ -166,7 +166,7 @@ mod tests {
         let text = match OfflineText::load() {
             Ok(text) => text,
             Err(e) if std::env::var_os("FASTLGS_REQUIRE_MODELS").is_some() => panic!("{e}"),
-            Err(e) => return eprintln!("SKIPPED: {e}"),
+            Err(e) => return crate::skip::skip(format_args!("{e}")),
         };
         let embedded = text
             .embed(&[

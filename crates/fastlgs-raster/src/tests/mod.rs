@@ -19,7 +19,7 @@ pub(crate) fn gpu() -> Option<Gpu> {
         Ok(gpu) => Some(gpu),
         Err(e) if std::env::var_os("FASTLGS_REQUIRE_GPU").is_some() => panic!("{e}"),
         Err(e) => {
-            eprintln!("SKIPPED: {e}");
+            crate::skip::skip(format_args!("{e}"));
             None
         }
     }

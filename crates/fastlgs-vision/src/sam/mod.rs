@@ -217,7 +217,7 @@ mod tests {
         toy_models::sam(export, &encoder, &decoder);
         if let Err(e) = crate::model_paths::runtime_library() {
             assert!(std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "{e}");
-            eprintln!("SKIPPED: {e}");
+            crate::skip::skip(format_args!("{e}"));
             return None;
         }
         Some((dir, Sam::load(&encoder, &decoder, config).unwrap()))
