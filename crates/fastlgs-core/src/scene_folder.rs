@@ -25,7 +25,7 @@ pub struct ModelFile {
 }
 
 /// Manifest of a scene (`scene.json`): its inputs, options and files.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Manifest {
     /// Version of FastLGS that wrote it.
     pub version: String,

@@ -128,3 +128,52 @@ impl Calibrations {
         known.unwrap_or(Self::CLIP)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_calibration_file_is_used_only_for_its_towers() {
+        let dir = tempfile::tempdir().unwrap();
+        let tower = dir.path().join("image.onnx");
+        let file = |sha256: &str| ModelFile {
+            path: tower.clone(),
+            bytes: 0,
+            sha256: sha256.to_owned(),
+        };
+        let files = |sha256: &str| {
+            ["clip_image", "clip_text"]
+                .map(|role| (role.to_owned(), file(sha256)))
+                .into_iter()
+                .collect::<BTreeMap<_, _>>()
+        };
+        let background = Background::ALL[1];
+        let calibration = CalibrationFile {
+            sha256: tower_hashes(&files("a")),
+            background,
+            calibrations: BTreeMap::new(),
+        };
+        assert!(!has_calibration_file(&tower));
+        fs::write_json(&calibration_path(&tower), &calibration).unwrap();
+        assert!(has_calibration_file(&tower));
+        assert_eq!(best_background(&files("a")), background);
+        assert_eq!(best_background(&files("b")), Background::default());
+    }
+
+    #[test]
+    fn backgrounds_have_names_in_the_manifest() {
+        for background in Background::ALL {
+            let manifest = Manifest {
+                crops: background_name(background),
+                ..Manifest::default()
+            };
+            assert_eq!(background_of(&manifest).unwrap(), background);
+        }
+        let unknown = Manifest {
+            crops: "plaid".to_owned(),
+            ..Manifest::default()
+        };
+        assert!(background_of(&unknown).is_err());
+    }
+}

@@ -331,3 +331,18 @@ fn bytes_of(path: &Path) -> u64 {
         std::fs::metadata(path).map_or(0, |m| m.len())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_extension_decides_what_is_written() {
+        let kind = |path: &str| output_kind(Path::new(path)).map_err(|e| e.to_string());
+        assert!(kind("a.json") == Ok(OutputKind::CameraPath));
+        assert!(kind("a.spz") == Ok(OutputKind::Gaussians));
+        assert!(kind("folder") == Ok(OutputKind::Folder));
+        assert!(kind("folder.v2/") == Ok(OutputKind::Folder));
+        assert!(kind("a.xyz").is_err_and(|e| e.contains(".xyz")));
+    }
+}

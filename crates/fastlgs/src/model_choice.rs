@@ -549,3 +549,33 @@ impl Encoder for ImportedEmbeddings {
             .collect())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_of_models_that_are_not_chosen_are_refused_by_name() {
+        let refused = |choice: ModelChoice| match choice.check() {
+            Err(Error::Option { option, .. }) => option,
+            other => panic!("{other:?}"),
+        };
+        let points = ModelChoice {
+            sam_points: Some(8),
+            ..ModelChoice::default()
+        };
+        assert_eq!(refused(points), "sam_points");
+        let image = ModelChoice {
+            clip_image: Some("a.onnx".into()),
+            ..ModelChoice::default()
+        };
+        assert_eq!(refused(image.clone()), "clip_image");
+        let alone = ModelChoice {
+            encoder: EncoderKind::Clip,
+            ..image
+        };
+        assert!(alone.check().is_ok());
+        let missing = alone.clip_files().unwrap_err().to_string();
+        assert!(missing.contains("clip_text") && missing.contains("a.onnx"));
+    }
+}

@@ -422,3 +422,107 @@ fn best_views(areas: &[&[(u32, u32)]]) -> Vec<Vec<usize>> {
     };
     areas.iter().map(best).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Silent;
+    use fastlgs_core::mask_list::{Mask as MaskOfView, RunLengths};
+    use fastlgs_core::{Level, MaskList};
+    use fastlgs_raster::CpuEngine;
+    use glam::{Vec2, Vec3};
+
+    /// Eight cameras around two balls of Gaussians. Each view has an exact mask of both.
+    fn two_balls(folder: &SceneFolder) -> (Gaussians, Vec<Camera>) {
+        let centres = [Vec3::new(-0.6, 0.0, 0.0), Vec3::new(0.6, 0.0, 0.0)];
+        let mut scene = Gaussians::default();
+        for k in 0..400 {
+            let (turn, y) = (2.399_963 * k as f32, 1.0 - (2 * k + 1) as f32 / 400.0);
+            let around = (1.0 - y * y).sqrt() * Vec2::from_angle(turn);
+            let on_ball = 0.4 * Vec3::new(around.x, y, around.y);
+            scene.push_sphere(centres[k % 2] + on_ball, 0.06, 0.95, [0.5; 3]);
+        }
+        let camera = |k: usize| {
+            // From above, so that neither ball hides the other.
+            let around = 2.0 * Vec2::from_angle(std::f32::consts::TAU * k as f32 / 8.0);
+            let eye = Vec3::new(around.x, 3.0, around.y);
+            Camera::look_at(&format!("{k}.png"), eye, Vec3::ZERO, Vec3::Y, 96, 72, 0.8)
+        };
+        let cameras: Vec<Camera> = (0..8).map(camera).collect();
+        for camera in &cameras {
+            let masks = centres.map(|centre| {
+                let runs = RunLengths::from_fn(96, 72, |x, y| {
+                    let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
+                    let to_world = camera.world_to_camera.inverse();
+                    let direction = to_world.transform_vector3(ray).normalize();
+                    let offset = centre - camera.centre();
+                    offset.cross(direction).length() < 0.45
+                });
+                MaskOfView::new(Level::Whole, runs)
+            });
+            let list = MaskList {
+                masks: masks.into(),
+                ..MaskList::new(96, 72)
+            };
+            list.save(&folder.masks_path(&camera.name)).unwrap();
+        }
+        (scene, cameras)
+    }
+
+    #[test]
+    fn two_separate_masks_become_two_objects_and_their_maps_lift_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = SceneFolder::new(dir.path());
+        let (mut scene, cameras) = two_balls(&folder);
+        let run = Run {
+            seed: 0,
+            device: "cpu",
+            progress: &Silent,
+        };
+        let mut mapper = Mapper {
+            folder: &folder,
+            cameras: &cameras,
+            config: MappingConfig {
+                objects: chosen::SelectionConfig::default(),
+                antialias: false,
+            },
+            engine: &mut CpuEngine::new(),
+            run: &run,
+        };
+        let mapped = mapper.map(&mut scene).unwrap();
+        assert_eq!(mapped.chosen.support.len(), 2);
+        assert!(mapped.chosen.support.iter().all(|s| s.iou > 0.8));
+        let ids = scene.object_ids.clone();
+        let (left, right) = (ids[0], ids[1]);
+        assert_ne!(left, right);
+        let of_ball = |k: usize| if k % 2 == 0 { left } else { right };
+        let wrong = (0..ids.len()).filter(|k| ids[*k] != of_ball(*k)).count();
+        assert!(wrong < 20, "{wrong} of {} Gaussians", ids.len());
+
+        let mut maps = 0;
+        mapper
+            .write_maps(&scene, &mapped, |_, map| {
+                maps += 1;
+                assert!(map.labels.contains(&left) && map.labels.contains(&right));
+                Ok(())
+            })
+            .unwrap();
+        assert_eq!(maps, cameras.len());
+        // Interrupted before the object table is saved: the maps cannot be kept.
+        assert!(unfinished(&folder).is_file());
+        mark_maps_finished(&folder);
+        assert!(!unfinished(&folder).is_file());
+
+        let grid = Grid::build(&[], &[], codes::lattice(2, 0));
+        scene.object_ids.fill(0);
+        mapper.lift(&mut scene, &grid).unwrap();
+        let same = scene.object_ids.iter().zip(&ids).filter(|(a, b)| a == b);
+        assert!(same.count() > ids.len() - 20);
+    }
+
+    #[test]
+    fn the_views_with_the_largest_areas_are_embedded() {
+        let areas = [(5, 0), (9, 3), (9, 1), (1, 2)];
+        assert_eq!(best_views(&[&areas]), [[1, 3, 0]]);
+    }
+}

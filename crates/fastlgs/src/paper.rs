@@ -70,3 +70,22 @@ pub fn assign_nearest_codes(scene: &mut Gaussians, grid: &Grid) {
         .map(|feature| codebook.owner(*feature).0)
         .collect();
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Vec3;
+
+    #[test]
+    fn gaussians_get_the_nearest_code_and_none_near_the_origin() {
+        let codes = vec![Vec3::new(0.9, 0.1, 0.1), Vec3::new(0.1, 0.9, 0.9)];
+        let grid = Grid::build(&[], &[], codes.clone());
+        let mut scene = Gaussians::default();
+        for feature in [codes[1] * 0.9, codes[0] + 0.05, Vec3::ZERO] {
+            scene.push_sphere(Vec3::ZERO, 0.1, 0.5, [0.5; 3]);
+            *scene.features.last_mut().unwrap() = feature;
+        }
+        assign_nearest_codes(&mut scene, &grid);
+        assert_eq!(scene.object_ids, [2, 1, 0]);
+    }
+}

@@ -449,3 +449,40 @@ fn held_out(
         .collect();
     Ok((0, names?))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn camera(name: &str) -> Camera {
+        let (eye, target) = (glam::Vec3::NEG_Z, glam::Vec3::ZERO);
+        Camera::look_at(name, eye, target, glam::Vec3::Y, 8, 8, 0.8)
+    }
+
+    #[test]
+    fn the_data_sets_test_photos_are_held_out_unless_none_shall_be() {
+        let cameras = ["a.png", "b.png"].map(camera);
+        let mut dataset = Dataset::default();
+        dataset.held_out.push("b.png".to_owned());
+        let config = PreprocessConfig::default();
+        let of = |config: &PreprocessConfig, dataset: &Dataset| {
+            held_out(config, dataset, &cameras).unwrap()
+        };
+        assert_eq!(of(&config, &dataset), (0, vec!["b.png".to_owned()]));
+        assert_eq!(of(&config, &Dataset::default()), (config.holdout, vec![]));
+        let none = PreprocessConfig {
+            holdout: 0,
+            ..config
+        };
+        assert_eq!(of(&none, &dataset), (0, vec![]));
+    }
+
+    #[test]
+    fn a_tiny_size_is_refused() {
+        let config = PreprocessConfig {
+            max_side: 63,
+            ..PreprocessConfig::default()
+        };
+        assert!(check(&config).unwrap_err().to_string().contains("63"));
+    }
+}

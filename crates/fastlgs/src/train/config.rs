@@ -372,3 +372,77 @@ impl TrainConfig {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn like_paper_implies_the_papers_mapping_and_features() {
+        let config = TrainConfig {
+            preset: Preset::LikePaper,
+            ..TrainConfig::default()
+        };
+        let resolved = config.resolved();
+        assert_eq!(resolved.mapping, Mapping::Paper);
+        assert_eq!(resolved.feature_mode, FeatureMode::Train);
+        assert_eq!(TrainConfig::default().resolved().mapping, Mapping::Global);
+    }
+
+    #[test]
+    fn automatic_budget_is_limited_by_the_pixels_and_a_given_one_is_kept() {
+        let config = TrainConfig::default();
+        assert_eq!(config.budget(20 * 1000), Budget::Auto(1000));
+        assert_eq!(config.budget(0), Budget::Auto(1));
+        let fixed = TrainConfig {
+            budget: Some(7),
+            ..config
+        };
+        assert_eq!(fixed.budget(20 * 1000), Budget::Fixed(7));
+    }
+
+    #[test]
+    fn few_views_get_a_low_sh_degree_except_like_the_paper() {
+        let standard = TrainConfig::default();
+        assert!(standard.degree(FEW_VIEWS - 1) <= FEW_VIEWS_SH_DEGREE);
+        let paper = TrainConfig {
+            preset: Preset::LikePaper,
+            ..standard
+        };
+        assert_eq!(paper.degree(FEW_VIEWS - 1), paper.degree(1000));
+    }
+
+    #[test]
+    fn masks_guide_training_unless_they_are_offline_or_features_are_trained() {
+        let config = TrainConfig::default();
+        assert!(config.masks_guide_training("sam"));
+        assert!(!config.masks_guide_training("offline"));
+        let on = TrainConfig {
+            borders: Switch::On,
+            ..config.clone()
+        };
+        assert!(on.masks_guide_training("offline"));
+        let trained = TrainConfig {
+            feature_mode: FeatureMode::Train,
+            ..on
+        };
+        assert!(!trained.masks_guide_training("sam"));
+    }
+
+    #[test]
+    fn cues_switch_the_terms_of_algorithm_1() {
+        let colors = TrainConfig {
+            cues: vec![Cue::Color],
+            ..TrainConfig::default()
+        };
+        let paper = colors.paper("clip");
+        assert!(paper.alpha > 0.0 && !paper.key_points);
+        assert_eq!(paper.theta, PaperConfig::default().theta);
+        let key_points = TrainConfig {
+            cues: vec![Cue::Keypoints],
+            ..TrainConfig::default()
+        };
+        let paper = key_points.paper("offline");
+        assert!(paper.alpha == 0.0 && paper.key_points && paper.theta == OFFLINE_THETA);
+    }
+}

@@ -221,3 +221,33 @@ fn write(inputs: Inputs, trained: Trained, mapped: MappedObjects) -> Result<Trai
     checkpoints::remove_all(&folder);
     Ok(report)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn contradictory_options_are_refused_by_name() {
+        let refused = |config: TrainConfig| match check(&config) {
+            Err(Error::Option { option, .. }) => option,
+            other => panic!("{other:?}"),
+        };
+        let features = TrainConfig {
+            feature_mode: FeatureMode::Train,
+            ..TrainConfig::default()
+        };
+        assert_eq!(refused(features), "feature_mode");
+        let keep = TrainConfig {
+            preset: Preset::LikePaper,
+            mapping: Mapping::Keep,
+            ..TrainConfig::default()
+        };
+        assert_eq!(refused(keep), "preset");
+        let freeze = TrainConfig {
+            freeze: true,
+            ..TrainConfig::default()
+        };
+        assert_eq!(refused(freeze), "freeze");
+        assert!(check(&TrainConfig::default()).is_ok());
+    }
+}
