@@ -1,5 +1,5 @@
-//! `docs/reference/commands.md` and the option types of the Python package, generated from the command
-//! line.
+//! `docs/reference/commands.md`, `docs/reference/reports.md` and the option types of the Python
+//! package, generated from the program.
 
 use crate::{config_file, program};
 use clap::{Arg, ArgAction, Command};
@@ -263,6 +263,63 @@ fn single_type(option: &Arg) -> String {
         .to_owned()
 }
 
+/// Commands and the structs of their reports.
+const REPORTS: [(&str, &str); 9] = [
+    ("make", "MakeReport"),
+    ("preprocess", "PreprocessReport"),
+    ("train", "TrainReport"),
+    ("query", "AnswerReport"),
+    ("eval", "EvalReport"),
+    ("export", "SceneReport"),
+    ("remove", "RemoveReport"),
+    ("teach", "TeachReport"),
+    ("synth", "SynthReport"),
+];
+
+/// Returns `docs/reference/reports.md`: the fields of the reports, from the source of the pipeline.
+fn reports(sources: &Path) -> String {
+    let mut out = String::from(
+        "# Reports\n\nGenerated from the program: the fields that `--json` prints, and that the functions of Python return.\n",
+    );
+    let mut files = vec![sources.to_owned()];
+    let mut text = String::new();
+    while let Some(path) = files.pop() {
+        if path.is_dir() {
+            let entries = path.read_dir().expect("a folder");
+            let mut entries: Vec<PathBuf> = entries.map(|e| e.expect("an entry").path()).collect();
+            entries.sort();
+            files.extend(entries);
+        } else {
+            text += &std::fs::read_to_string(&path).expect("a source file");
+        }
+    }
+    for (command, report) in REPORTS {
+        let _ = write!(
+            out,
+            "\n## fastlgs {command}\n\n| field | meaning |\n|---|---|\n"
+        );
+        let head = format!("pub struct {report} {{\n");
+        let (_, body) = text.split_once(&head).unwrap_or_else(|| panic!("{head}"));
+        let (body, _) = body.split_once("\n}\n").expect("its end");
+        let mut meaning: Vec<&str> = Vec::new();
+        for line in body.lines().map(str::trim) {
+            if let Some(words) = line.strip_prefix("/// ") {
+                meaning.push(words);
+            } else if let Some((field, _)) =
+                line.strip_prefix("pub ").and_then(|f| f.split_once(':'))
+            {
+                let _ = writeln!(
+                    out,
+                    "| `{field}` | {} |",
+                    meaning.join(" ").replace('|', "\\|")
+                );
+                meaning.clear();
+            }
+        }
+    }
+    out
+}
+
 /// Breaks a text into lines of at most `width` characters.
 fn wrapped(text: &str, width: usize) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
@@ -286,6 +343,10 @@ fn generated_files_are_current() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
     let files = [
         ("docs/reference/commands.md", reference()),
+        (
+            "docs/reference/reports.md",
+            reports(&root.join("crates/fastlgs/src")),
+        ),
         (
             "crates/fastlgs-py/python/fastlgs/options.py",
             python_options(),
