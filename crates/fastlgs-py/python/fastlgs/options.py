@@ -97,8 +97,9 @@ class TrainOptions(TypedDict, total=False):
     # black; if --init names the Gaussians of this scene, the background of their training
     background: Dict[str, Any]
 
-    # Use masks to train Gaussians to end at the borders of objects. Needs --mapping global and
-    # --feature-mode lift
+    # Use masks to train Gaussians to end at the borders of objects. `auto` uses masks of SAM
+    # and imported ones; those of the offline segmenter only follow edges of the photos. Needs
+    # --mapping global and --feature-mode lift
     borders: Literal["auto", "on", "off"]
 
     # Limit of Gaussians: a number, or `auto`. `auto` removes Gaussians that hardly change the
@@ -114,7 +115,8 @@ class TrainOptions(TypedDict, total=False):
     # rounded up to a multiple of 20
     curve: int
 
-    # Learn an affine exposure for each training photo
+    # Learn an affine exposure for each training photo. `auto` does so if the photos' brightness
+    # varies
     exposure: Literal["auto", "on", "off"]
 
     # How Gaussians get their codes
