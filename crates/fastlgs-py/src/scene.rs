@@ -111,6 +111,14 @@ impl Opened {
     }
 }
 
+/// Returns three planes as pixels with three values.
+fn interleaved(planes: &[f32]) -> Vec<f32> {
+    let pixels = planes.len() / 3;
+    (0..pixels)
+        .flat_map(|p| [planes[p], planes[pixels + p], planes[2 * pixels + p]])
+        .collect()
+}
+
 /// Converts values in row-major order to a NumPy array of this shape.
 fn to_numpy<'py, T: numpy::Element>(
     py: Python<'py>,
@@ -330,21 +338,12 @@ impl Scene {
             self.with(py, |opened| {
                 let camera = opened.camera(&which)?;
                 let scene = &mut opened.scene;
-                let frame = if color {
-                    scene.render(&camera)
+                Ok(if color {
+                    (size(&camera), interleaved(scene.render(&camera)?.color()))
                 } else {
-                    scene.render_feature(&camera)
-                }?;
-                let pixels = size(&camera).iter().product::<usize>();
-                let planes = if color {
-                    frame.color()
-                } else {
-                    frame.feature()
-                };
-                let values: Vec<f32> = (0..pixels)
-                    .flat_map(|p| [planes[p], planes[pixels + p], planes[2 * pixels + p]])
-                    .collect();
-                Ok((size(&camera), values))
+                    let frame = scene.render_feature(&camera)?;
+                    (size(&camera), interleaved(frame.feature()))
+                })
             })
         };
         match what {
@@ -364,15 +363,9 @@ impl Scene {
                 let (size, values) = self.with(py, |opened| {
                     let camera = opened.camera(&which)?;
                     let unit = opened.scene.manifest().frame.scale as f32;
-                    Ok((
-                        size(&camera),
-                        opened
-                            .scene
-                            .render_depth(&camera)?
-                            .into_iter()
-                            .map(|depth| unit * depth)
-                            .collect(),
-                    ))
+                    let mut depths = opened.scene.render_depth(&camera)?;
+                    depths.iter_mut().for_each(|depth| *depth *= unit);
+                    Ok((size(&camera), depths))
                 })?;
                 to_numpy(py, values, &size)
             }
@@ -437,35 +430,22 @@ impl Scene {
             .iter()
             .map(|o| 1.0 / (1.0 + (-o).exp()))
             .collect();
+        let rotations: Vec<f32> = scene.rotations.iter().flat_map(unit).collect();
+        let sh: Vec<f32> = sh.flat_map(|c| c.to_array()).collect();
         let arrays = PyDict::new(py);
         // Double precision: single precision would lose digits far from the origin.
-        let means = match frame.is_identity() {
-            true => to_numpy(py, rows(&scene.means), &[n, 3])?,
-            false => to_numpy(
-                py,
-                scene
-                    .means
-                    .iter()
-                    .flat_map(|mean| frame.to_world(*mean).to_array())
-                    .collect(),
-                &[n, 3],
-            )?,
+        let means = if frame.is_identity() {
+            to_numpy(py, rows(&scene.means), &[n, 3])?
+        } else {
+            let in_world = |mean: &Vec3| frame.to_world(*mean).to_array();
+            let means: Vec<f64> = scene.means.iter().flat_map(in_world).collect();
+            to_numpy(py, means, &[n, 3])?
         };
         arrays.set_item("means", means)?;
         arrays.set_item("scales", to_numpy(py, scales, &[n, 3])?)?;
-        arrays.set_item(
-            "rotations",
-            to_numpy(py, scene.rotations.iter().flat_map(unit).collect(), &[n, 4])?,
-        )?;
+        arrays.set_item("rotations", to_numpy(py, rotations, &[n, 4])?)?;
         arrays.set_item("opacities", to_numpy(py, opacities, &[n])?)?;
-        arrays.set_item(
-            "sh",
-            to_numpy(
-                py,
-                sh.flat_map(|c| c.to_array()).collect(),
-                &[n, 1 + rest, 3],
-            )?,
-        )?;
+        arrays.set_item("sh", to_numpy(py, sh, &[n, 1 + rest, 3])?)?;
         arrays.set_item("features", to_numpy(py, rows(&scene.features), &[n, 3])?)?;
         arrays.set_item("object_ids", to_numpy(py, scene.object_ids, &[n])?)?;
         Ok(arrays)

@@ -419,39 +419,52 @@ pub async fn render(
                 "nothing would be left to show; hide fewer objects",
             ));
         }
-        let frame = worker.scene.render(&camera)?;
-        let color = image_io::from_planar(frame.color(), frame.width, frame.height);
         let picture = if what == "objects" {
-            let ids = worker.scene.field(&camera, None)?.owners(&worker.grid);
-            RgbImage::from_fn(ids.width, ids.height, |x, y| {
-                Rgb(turbo::id_color(ids.at(x, y)))
-            })
+            object_picture(worker, &camera)?
         } else if let Some(text) = &text {
-            let field = worker.scene.field(&camera, None)?;
-            let embedded_query = ObjectQuery::Text(text.clone()).embed(&worker.scene, &[])?;
-            let found =
-                embedded_query.find(&worker.grid, &field, &camera, &QueryConfig::default())?;
-            heatmap(&color, &field.relevancy(&worker.grid, &found.heat()))
-        } else if wanted.selected.is_empty() {
-            color
+            text_heatmap(worker, &camera, text)?
         } else {
-            let hits: Vec<query::Hit> = wanted
-                .selected
-                .iter()
-                .map(|id| query::Hit {
-                    id: *id,
-                    score: 1.0,
-                })
-                .collect();
-            overlay(
-                &color,
-                &worker.scene.field(&camera, None)?.mask(&worker.grid, &hits),
-            )
+            color_picture(worker, &camera, &wanted.selected)?
         };
         Ok(image_io::encode_png(picture)?)
     };
     let data = app.ready()?.run(work).await?;
     Ok(([(header::CONTENT_TYPE, "image/png")], data).into_response())
+}
+
+/// Renders a view with a colour for each object.
+fn object_picture(worker: &mut SceneWorker, camera: &Camera) -> Answer<RgbImage> {
+    let ids = worker.scene.field(camera, None)?.owners(&worker.grid);
+    let color = |x, y| Rgb(turbo::id_color(ids.at(x, y)));
+    Ok(RgbImage::from_fn(ids.width, ids.height, color))
+}
+
+/// Renders a view with the heat map of a text.
+fn text_heatmap(worker: &mut SceneWorker, camera: &Camera, text: &str) -> Answer<RgbImage> {
+    let color = color_picture(worker, camera, &[])?;
+    let field = worker.scene.field(camera, None)?;
+    let query = ObjectQuery::Text(text.to_owned()).embed(&worker.scene, &[])?;
+    let found = query.find(&worker.grid, &field, camera, &QueryConfig::default())?;
+    Ok(heatmap(
+        &color,
+        &field.relevancy(&worker.grid, &found.heat()),
+    ))
+}
+
+/// Renders a view. If objects are selected, everything else is dimmed.
+fn color_picture(worker: &mut SceneWorker, camera: &Camera, selected: &[u16]) -> Answer<RgbImage> {
+    let frame = worker.scene.render(camera)?;
+    let color = image_io::from_planar(frame.color(), frame.width, frame.height);
+    if selected.is_empty() {
+        return Ok(color);
+    }
+    let hit = |id: &u16| query::Hit {
+        id: *id,
+        score: 1.0,
+    };
+    let hits: Vec<query::Hit> = selected.iter().map(hit).collect();
+    let field = worker.scene.field(camera, None)?;
+    Ok(overlay(&color, &field.mask(&worker.grid, &hits)))
 }
 
 /// Query string of `GET /api/export`.
@@ -500,9 +513,9 @@ pub async fn export(
     );
     let work = move |worker: &mut SceneWorker| {
         worker.set_visible(&VisibleObjects::default())?;
-        let selected = selection::gaussians(worker.scene.gaussians(), &worker.grid, &ids);
-        if selected.is_empty() || (!wanted.keep && selected.len() == worker.scene.gaussians().len())
-        {
+        let all = worker.scene.gaussians();
+        let selected = selection::gaussians(all, &worker.grid, &ids);
+        if selected.is_empty() || (!wanted.keep && selected.len() == all.len()) {
             return Err(Failure::bad_request(
                 "there is nothing to write: the selection has no Gaussians",
             ));
@@ -511,27 +524,14 @@ pub async fn export(
             .map_err(|e| anyhow::anyhow!("cannot create a temporary folder: {e}"))?;
         let path = folder.path().join("selection").with_extension(&ending);
         let world = World::of(worker.scene.manifest(), worker.scene.cameras());
-        selection::export(
-            &path,
-            worker.scene.gaussians(),
-            &world,
-            &selected,
-            wanted.keep,
-        )?;
+        selection::export(&path, all, &world, &selected, wanted.keep)?;
         Ok(fastlgs_core::fs::read(&path)?)
     };
     let data: Vec<u8> = app.ready()?.run(work).await?;
     let mut headers = HeaderMap::new();
-    let file_name: String = name
-        .chars()
-        .map(|c| {
-            if c.is_ascii_alphanumeric() || "-_.".contains(c) {
-                c
-            } else {
-                '_'
-            }
-        })
-        .collect();
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    let plain = name.chars().map(|c| if is_plain(c) { c } else { '_' });
+    let file_name: String = plain.collect();
     let disposition = format!("attachment; filename=\"{file_name}\"");
     headers.insert(
         header::CONTENT_DISPOSITION,

@@ -64,68 +64,22 @@ impl Guard {
     /// machine sends that name as host.
     fn refusal(&self, request: &Parts) -> Option<Failure> {
         if self.loopback {
-            let host = request
-                .headers
-                .get(header::HOST)
-                .and_then(|h| h.to_str().ok())
-                .unwrap_or_default();
-            let name = host
-                .rsplit_once(':')
-                .filter(|(_, port)| port.parse::<u16>().is_ok())
-                .map_or(host, |(name, _)| name);
-            let bare = name.trim_start_matches('[').trim_end_matches(']');
-            let known = self
-                .hosts
-                .iter()
-                .any(|host| host.eq_ignore_ascii_case(bare));
-            let own = known
-                || bare == "localhost"
-                || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
-            if !own {
-                return Some(Failure::new(
-                    StatusCode::FORBIDDEN,
-                    format!(
-                        "this server does not accept the host name '{name}'; use its loopback address, or set the option host_name to {bare} if that is a proxy"
-                    ),
-                ));
-            }
-            // Browsers report which site sends a request. Other sites may link to the page, but not
-            // use the interface.
-            let from = request
-                .headers
-                .get("sec-fetch-site")
-                .and_then(|h| h.to_str().ok())
-                .unwrap_or_default();
-            let foreign = matches!(from, "cross-site" | "same-site") && is_api(request);
-            return foreign.then(|| {
-                Failure::new(
-                    StatusCode::FORBIDDEN,
-                    "pages of other sites may not use this server",
-                )
-            });
+            return self.loopback_refusal(request);
         }
         let wanted = self.token.as_deref()?;
         // The page itself is not secret. Its requests to the interface contain the token.
         if !is_api(request) {
             return None;
         }
-        let by_header = request
-            .headers
-            .get(header::AUTHORIZATION)
-            .and_then(|h| h.to_str().ok())
-            .and_then(|h| h.strip_prefix("Bearer "));
+        let by_header = header_text(request, &header::AUTHORIZATION).strip_prefix("Bearer ");
         let by_query = request
             .uri
             .query()
             .and_then(|q| q.split('&').find_map(|p| p.strip_prefix("token=")));
         // Compares all bytes, so that the time reveals nothing about the token.
         let same = |given: &str| {
-            given.len() == wanted.len()
-                && given
-                    .bytes()
-                    .zip(wanted.bytes())
-                    .fold(0, |sum, (a, b)| sum | (a ^ b))
-                    == 0
+            let pairs = given.bytes().zip(wanted.bytes());
+            given.len() == wanted.len() && pairs.fold(0, |sum, (a, b)| sum | (a ^ b)) == 0
         };
         let known = by_header.is_some_and(same) || by_query.is_some_and(same);
         (!known).then(|| {
@@ -135,6 +89,46 @@ impl Guard {
             )
         })
     }
+
+    /// Refuses requests to a local server that other sites send, or that use a foreign host name.
+    fn loopback_refusal(&self, request: &Parts) -> Option<Failure> {
+        let host = header_text(request, &header::HOST);
+        let name = host
+            .rsplit_once(':')
+            .filter(|(_, port)| port.parse::<u16>().is_ok())
+            .map_or(host, |(name, _)| name);
+        let bare = name.trim_start_matches('[').trim_end_matches(']');
+        let mut hosts = self.hosts.iter();
+        let own = hosts.any(|host| host.eq_ignore_ascii_case(bare))
+            || bare == "localhost"
+            || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
+        if !own {
+            return Some(Failure::new(
+                StatusCode::FORBIDDEN,
+                format!(
+                    "this server does not accept the host name '{name}'; use its loopback address, or set the option host_name to {bare} if that is a proxy"
+                ),
+            ));
+        }
+        // Browsers report which site sends a request. Other sites may link to the page, but not use
+        // the interface.
+        let from = header_text(request, "sec-fetch-site");
+        let foreign = matches!(from, "cross-site" | "same-site") && is_api(request);
+        foreign.then(|| {
+            Failure::new(
+                StatusCode::FORBIDDEN,
+                "pages of other sites may not use this server",
+            )
+        })
+    }
+}
+
+/// Returns the text of a header; empty if it is missing.
+fn header_text(request: &Parts, name: impl header::AsHeaderName) -> &str {
+    let value = request.headers.get(name);
+    value
+        .and_then(|value| value.to_str().ok())
+        .unwrap_or_default()
 }
 
 /// Returns whether a request is for the interface, not for a file of the page.

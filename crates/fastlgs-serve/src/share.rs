@@ -104,28 +104,7 @@ pub fn share(config: &ShareConfig, run: &Run) -> Result<ShareReport> {
     let (words, found) = write_files(partial.path(), &mut worker, config, run)?;
     let size = bytes(partial.path());
     if is_export {
-        // Replaces only files of an earlier export: the folder may be a repository.
-        let made = files_below(partial.path(), Path::new(""))?;
-        if let Some(foreign) = made
-            .iter()
-            .map(|file| root.join(file))
-            .find(|path| path.exists() && !listed.iter().any(|own| root.join(own) == *path))
-        {
-            bail!(
-                "{}: this file was not written by FastLGS and would be overwritten; move it, or choose another folder",
-                foreign.display()
-            );
-        }
-        for file in &made {
-            let place = root.join(file);
-            let parent = place.parent().unwrap_or(root);
-            std::fs::create_dir_all(parent).with_context(|| parent.display().to_string())?;
-            std::fs::rename(partial.path().join(file), &place)
-                .with_context(|| place.display().to_string())?;
-        }
-        for old in listed.difference(&made) {
-            let _ = std::fs::remove_file(root.join(old));
-        }
+        replace_export(root, &listed, partial.path())?;
     } else {
         let partial = partial.keep();
         make_readable(&partial)?;
@@ -139,6 +118,30 @@ pub fn share(config: &ShareConfig, run: &Run) -> Result<ShareReport> {
         words,
         found,
     })
+}
+
+/// Replaces the files of an earlier export, `listed`, by those in `partial`. Other files stay: the
+/// folder may be a repository.
+fn replace_export(root: &Path, listed: &BTreeSet<PathBuf>, partial: &Path) -> Result<()> {
+    let made = files_below(partial, Path::new(""))?;
+    let is_foreign =
+        |path: &PathBuf| path.exists() && !listed.iter().any(|own| root.join(own) == *path);
+    if let Some(foreign) = made.iter().map(|file| root.join(file)).find(is_foreign) {
+        bail!(
+            "{}: this file was not written by FastLGS and would be overwritten; move it, or choose another folder",
+            foreign.display()
+        );
+    }
+    for file in &made {
+        let place = root.join(file);
+        let parent = place.parent().unwrap_or(root);
+        std::fs::create_dir_all(parent).with_context(|| parent.display().to_string())?;
+        std::fs::rename(partial.join(file), &place).with_context(|| place.display().to_string())?;
+    }
+    for old in listed.difference(&made) {
+        let _ = std::fs::remove_file(root.join(old));
+    }
+    Ok(())
 }
 
 /// First line of `files.txt`. It identifies a folder as an export.

@@ -84,19 +84,11 @@ pub fn calibrate(choice: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
             ..TextQuery::new(texts.embed(&[text])?, Calibration::CLIP)
         })
     };
-    let is_present = |name: &str| {
-        scenes_by_background[0]
-            .iter()
-            .flat_map(|k| &k.objects_and_parts)
-            .any(|t| t.name.contains(name))
-    };
-    let absent = absent_where(is_present);
-    let no_separation = || {
-        format!(
-            "{}: the encoder cannot distinguish the generated objects by their names; check that it is an image tower of CLIP",
-            image_tower.display()
-        )
-    };
+    let objects: Vec<&SceneObject> = scenes_by_background[0]
+        .iter()
+        .flat_map(|scene| &scene.objects_and_parts)
+        .collect();
+    let absent = absent_where(|name: &str| objects.iter().any(|o| o.name.contains(name)));
     let (mut calibrations, mut separation) = (BTreeMap::new(), BTreeMap::new());
     for (background, known) in Background::ALL.into_iter().zip(&scenes_by_background) {
         let named = by_names(known, &absent, query)?;
@@ -112,26 +104,26 @@ pub fn calibrate(choice: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
         .iter()
         .rev()
         .max_by(|a, b| a.1.total_cmp(b.1))
-        .with_context(no_separation)?;
+        .with_context(|| {
+            format!(
+                "{}: the encoder cannot distinguish the generated objects by their names; check that it is an image tower of CLIP",
+                image_tower.display()
+            )
+        })?;
     let (background, Calibrations { texts, pictures }) = (*background, calibrations[background]);
     let kept = calibration_path(&image_tower);
-    fs::write_json(
-        &kept,
-        &CalibrationFile {
-            sha256: calibrations::tower_hashes(&choice.files()?),
-            background,
-            calibrations,
-        },
-    )?;
+    let file = CalibrationFile {
+        sha256: calibrations::tower_hashes(&choice.files()?),
+        background,
+        calibrations,
+    };
+    fs::write_json(&kept, &file)?;
     Ok(CalibrationReport {
         background,
         separation,
         texts,
         pictures,
-        things: scenes_by_background[0]
-            .iter()
-            .map(|k| k.objects_and_parts.len())
-            .sum(),
+        things: objects.len(),
         absent: absent.len(),
         kept,
         seconds: clock.elapsed().as_secs_f64(),

@@ -98,29 +98,9 @@ pub fn make_scene(
     let photos = photos
         .canonicalize()
         .with_context(|| format!("{}: the photos cannot be opened", photos.display()))?;
-    let seeds = runs.map(|run| run.seed);
-    // Leave out the paths of the scene, because a scene may be moved.
-    let preprocess_options = preprocess::PreprocessConfig {
-        photos: photos.clone(),
-        output: PathBuf::new(),
-        ..preprocess.clone()
-    };
-    let how = json!([
-        preprocess_options,
-        train::TrainConfig {
-            scene: PathBuf::new(),
-            ..train.clone()
-        }
-    ]);
     check_apart(&photos, &preprocess.output)?;
     let folder = SceneFolder::new(&preprocess.output);
-    let made = json!([
-        env!("CARGO_PKG_VERSION"),
-        conse::VERSION,
-        seeds,
-        how,
-        fingerprints(&photos)?
-    ]);
+    let made = made_from(&photos, preprocess, train, runs.map(|run| run.seed))?;
     // A scene that cannot be read is made again.
     let known = folder.manifest().ok();
     let known = known.and_then(|manifest| SceneNotes::read(&manifest, &folder.root).ok());
@@ -144,17 +124,40 @@ pub fn make_scene(
         crate::preprocess::preprocess_locked(preprocess, &lock, runs[0])?;
         record(&folder, &made)?;
     }
-    let report = train::train_locked(
-        &train::TrainConfig {
-            resume: can_resume || train.resume,
-            ..train.clone()
-        },
-        &lock,
-        runs[1],
-    )?;
+    let train = train::TrainConfig {
+        resume: can_resume || train.resume,
+        ..train.clone()
+    };
+    let report = train::train_locked(&train, &lock, runs[1])?;
     // Record the photos as they were before training: later changes are not in the scene.
     record(&folder, &made)?;
     Ok((State::Made, report))
+}
+
+/// Returns what a scene is made from: version, seeds, options and photos. Paths of the scene are left
+/// out, because a scene may be moved.
+fn made_from(
+    photos: &Path,
+    preprocess: &preprocess::PreprocessConfig,
+    train: &train::TrainConfig,
+    seeds: [u64; 2],
+) -> Result<serde_json::Value> {
+    let preprocess = preprocess::PreprocessConfig {
+        photos: photos.to_owned(),
+        output: PathBuf::new(),
+        ..preprocess.clone()
+    };
+    let train = train::TrainConfig {
+        scene: PathBuf::new(),
+        ..train.clone()
+    };
+    Ok(json!([
+        env!("CARGO_PKG_VERSION"),
+        conse::VERSION,
+        seeds,
+        [json!(preprocess), json!(train)],
+        fingerprints(photos)?
+    ]))
 }
 
 /// Records in the manifest the photos and options that the scene was made from.

@@ -332,35 +332,13 @@ fn embed(
         let photo = folder.photo(&camera.name)?;
         let mut found = Vec::new();
         for layer in layers {
-            let wanted: BTreeSet<u16> = layer
-                .iter()
-                .copied()
-                .filter(|id| embedding_views[usize::from(*id) - 1].contains(&view))
-                .collect();
-            if wanted.is_empty() {
-                continue;
+            let mut wanted = layer.clone();
+            wanted.retain(|id| embedding_views[usize::from(*id) - 1].contains(&view));
+            if !wanted.is_empty() {
+                let map = map_of(&map, &wanted, lists);
+                let (name, encoder) = (&camera.name, encoder.as_ref());
+                found.extend(masks::descriptors(name, &photo, view, &map, encoder)?);
             }
-            let on_layer: Vec<u16> = lists
-                .iter()
-                .map(|list| {
-                    list.iter()
-                        .find(|id| wanted.contains(id))
-                        .copied()
-                        .unwrap_or(0)
-                })
-                .collect();
-            let labels = map
-                .labels
-                .iter()
-                .map(|l| on_layer[usize::from(*l)])
-                .collect();
-            found.extend(masks::descriptors(
-                &camera.name,
-                &photo,
-                view,
-                &LabelMap { labels, ..map },
-                encoder.as_ref(),
-            )?);
         }
         work.advance()?;
         Ok((found, PhotoStats::of(&photo)))
@@ -381,6 +359,21 @@ fn embed(
         .iter_mut()
         .for_each(|mask: &mut Mask| mask.area *= sharpness[mask.view]);
     Ok((found, object_of))
+}
+
+/// Returns the map of some objects that share no Gaussians, from the object map of a view. `lists`
+/// holds the objects of each id.
+fn map_of(map: &LabelMap, wanted: &BTreeSet<u16>, lists: &[Vec<u16>]) -> LabelMap {
+    let object = |list: &Vec<u16>| list.iter().find(|id| wanted.contains(id)).copied();
+    let of_id: Vec<u16> = lists.iter().map(|list| object(list).unwrap_or(0)).collect();
+    LabelMap {
+        labels: map
+            .labels
+            .iter()
+            .map(|id| of_id[usize::from(*id)])
+            .collect(),
+        ..*map
+    }
 }
 
 /// Summary of global mapping.
@@ -495,7 +488,7 @@ mod tests {
         let ids = scene.object_ids.clone();
         let (left, right) = (ids[0], ids[1]);
         assert_ne!(left, right);
-        let of_ball = |k: usize| if k % 2 == 0 { left } else { right };
+        let of_ball = |k: usize| if k.is_multiple_of(2) { left } else { right };
         let wrong = (0..ids.len()).filter(|k| ids[*k] != of_ball(*k)).count();
         assert!(wrong < 20, "{wrong} of {} Gaussians", ids.len());
 

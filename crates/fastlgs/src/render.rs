@@ -100,18 +100,15 @@ pub fn render(config: &RenderConfig, run: &Run) -> Result<RenderReport> {
         let (w, h) = (camera.width as usize, camera.height as usize);
         let mut rendered = Duration::ZERO;
         let mut path = |what: &str, ending: &str| {
-            let path = config
-                .output
-                .join(format!("{}.{what}.{ending}", camera.name));
+            let name = format!("{}.{what}.{ending}", camera.name);
+            let path = config.output.join(name);
             files.push(path.clone());
             path
         };
         if config.what.contains(&RenderContent::Color) {
             let frame = timed(&mut rendered, || scene.render(camera))?;
-            image_io::save_png(
-                &path("color", "png"),
-                image_io::from_planar(frame.color(), frame.width, frame.height),
-            )?;
+            let picture = image_io::from_planar(frame.color(), frame.width, frame.height);
+            image_io::save_png(&path("color", "png"), picture)?;
         }
         if config.what.contains(&RenderContent::Feature) {
             let frame = timed(&mut rendered, || scene.render_feature(camera))?;
@@ -130,25 +127,19 @@ pub fn render(config: &RenderConfig, run: &Run) -> Result<RenderReport> {
         }
         if config.what.contains(&RenderContent::Objects) {
             let ids = timed(&mut rendered, || scene.field(camera, None))?.owners(&*scene.grid()?);
-            let picture = RgbImage::from_fn(camera.width, camera.height, |x, y| {
-                Rgb(turbo::id_color(ids.at(x, y)))
-            });
+            let color = |x, y| Rgb(turbo::id_color(ids.at(x, y)));
+            let picture = RgbImage::from_fn(camera.width, camera.height, color);
             image_io::save_png(&path("objects", "png"), picture)?;
         }
         milliseconds.push(rendered.as_secs_f64() * 1e3);
         work.advance()?;
     }
-    let (scene_root, gaussians, adapter) = (
-        config.scene.clone(),
-        scene.gaussians().len(),
-        scene.adapter(),
-    );
     Ok(RenderReport {
-        scene: scene_root,
+        scene: config.scene.clone(),
         files,
         size,
-        gaussians,
+        gaussians: scene.gaussians().len(),
         render_ms: milliseconds,
-        adapter,
+        adapter: scene.adapter(),
     })
 }

@@ -49,20 +49,15 @@ impl StagedOutput {
         reserved: impl IntoIterator<Item = String>,
         manifest: &Manifest,
     ) -> Result<()> {
-        let listed = scene
-            .manifest()
-            .map(|earlier| earlier.files)
-            .unwrap_or_default();
+        let listed = scene.manifest().map(|earlier| earlier.files);
+        let listed = listed.unwrap_or_default();
         let staged_files = files_in(&self.folder.root)?;
         let new: BTreeSet<String> = staged_files.iter().cloned().chain(reserved).collect();
-        if let Some(foreign) = new
-            .iter()
-            .find(|file| !listed.contains(*file) && scene.root.join(file).exists())
-        {
-            let path = scene.root.join(foreign);
+        let is_foreign = |file: &&String| !listed.contains(*file) && scene.root.join(file).exists();
+        if let Some(foreign) = new.iter().find(is_foreign) {
             bail!(
                 "{}: this file does not belong to the scene and is in the way; move it, or choose a new folder",
-                path.display()
+                scene.root.join(foreign).display()
             );
         }
         let is_replaced = |file: &String| {

@@ -86,47 +86,30 @@ fn scene(root: &Path, common: &ui::Common) -> Result<Outcome> {
         "made_by": manifest,
     });
     let count_or_hint = |count: Option<usize>| {
-        count.map_or_else(
-            || "none yet; run fastlgs train".to_owned(),
-            words::thousands,
-        )
+        let hint = || "none yet; run fastlgs train".to_owned();
+        count.map_or_else(hint, words::thousands)
     };
-    report::write_summary(common, &value, |_| {
-        words::table(&[
-            (
-                "scene",
-                format!(
-                    "{}, made by fastlgs {}, seed {}",
-                    root.display(),
-                    manifest.version,
-                    manifest.seed
-                ),
-            ),
-            (
-                "photos",
-                format!(
-                    "{} from {}, {held_out} of them held out",
-                    cameras.len(),
-                    manifest.photos.display()
-                ),
-            ),
-            (
-                "models",
-                format!(
-                    "masks: {}, embeddings: {}",
-                    manifest.segmenter, manifest.encoder
-                ),
-            ),
-            ("Gaussians", count_or_hint(gaussians)),
-            ("objects", count_or_hint(objects)),
-            (
-                "queries",
-                format!(
-                    "need {}",
-                    words::megabytes(fastlgs::scene::query_file_bytes(root))
-                ),
-            ),
-            ("warnings", manifest.warnings.join("\n          ")),
-        ])
-    })
+    let (path, version, seed) = (root.display(), &manifest.version, manifest.seed);
+    let (photos, source) = (cameras.len(), manifest.photos.display());
+    let (segmenter, encoder) = (&manifest.segmenter, &manifest.encoder);
+    let needed = words::megabytes(fastlgs::scene::query_file_bytes(root));
+    let rows = [
+        (
+            "scene",
+            format!("{path}, made by fastlgs {version}, seed {seed}"),
+        ),
+        (
+            "photos",
+            format!("{photos} from {source}, {held_out} of them held out"),
+        ),
+        (
+            "models",
+            format!("masks: {segmenter}, embeddings: {encoder}"),
+        ),
+        ("Gaussians", count_or_hint(gaussians)),
+        ("objects", count_or_hint(objects)),
+        ("queries", format!("need {needed}")),
+        ("warnings", manifest.warnings.join("\n          ")),
+    ];
+    report::write_summary(common, &value, |_| words::table(&rows))
 }

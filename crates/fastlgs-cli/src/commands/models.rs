@@ -52,12 +52,15 @@ enum Action {
 
 pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     match &args.action {
-        Action::List => {}
-        Action::InstallOffline => models::install_offline(|line| {
-            if !common.quiet {
-                eprintln!("models: {line}");
-            }
-        })?,
+        Action::List => list(common),
+        Action::InstallOffline => {
+            models::install_offline(|line| {
+                if !common.quiet {
+                    eprintln!("models: {line}");
+                }
+            })?;
+            list(common)
+        }
         Action::Calibrate {
             clip,
             clip_image,
@@ -72,7 +75,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
                 clip_text,
                 ..ModelChoice::default()
             };
-            return report::write_fields(common, &calibrate::calibrate(&choice, run)?);
+            report::write_fields(common, &calibrate::calibrate(&choice, run)?)
         }
         Action::Pull { name, base_url } => {
             let model = ModelPair::find(name)?;
@@ -82,12 +85,15 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
             };
             let pulled = pull::pull(&model, base_url, &model.folder(), report_progress)?;
             drop(work);
-            return report::write_fields(
-                common,
-                &serde_json::json!({ "model": model, "folder": model.folder(), "files": pulled }),
-            );
+            let pulled =
+                serde_json::json!({ "model": model, "folder": model.folder(), "files": pulled });
+            report::write_fields(common, &pulled)
         }
     }
+}
+
+/// Lists the installed models, and those that can be installed.
+fn list(common: &ui::Common) -> Result<Outcome> {
     let mut files = Vec::new();
     for file in models::OFFLINE_FILES {
         let found = model_paths::digest(&model_paths::offline_dir().join(file)).ok();

@@ -220,7 +220,7 @@ mod tests {
         let votes = TileVotes::new(&ranges, &tiles).unwrap();
         assert_eq!(votes.total, 65);
         assert_eq!(votes.windows(30), [0..3, 3..4, 4..5]);
-        assert_eq!(votes.windows(1000), [0..5]);
+        assert_eq!(votes.windows(1000), vec![0..5; 1]);
         assert_eq!(votes.sums(&(2..4)), 10..60);
         // A tile alone may exceed the limit; the device then refuses the buffer.
         assert_eq!(votes.windows(1).len(), 5);

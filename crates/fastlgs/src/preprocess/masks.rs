@@ -7,7 +7,7 @@ use crate::error::{Context, bail};
 use crate::model_choice::SegmenterKind;
 use crate::{Result, Run};
 use fastlgs_core::undistort::Distortion;
-use fastlgs_core::{Level, SceneFolder};
+use fastlgs_core::{Level, MaskList, SceneFolder};
 use fastlgs_vision::Segmenter;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -28,33 +28,21 @@ pub(super) fn segment(
     let work = run.work("masks", training.len() as u64);
     let identity = config.eyes.segmenter_identity()?;
     let of_photo = |photo: &PreparedPhoto| -> Result<[usize; 3]> {
-        let name = &photo.camera.name;
         let make = || {
+            let name = &photo.camera.name;
             segmenter
                 .segment(name, &folder.photo(name)?)
                 .with_context(|| format!("segmenting {name}"))
         };
-        let mut list = match &identity {
-            Some(identity) => cache.get(
-                "masks",
-                &cache::key(&[b"list", &photo.key, identity.as_bytes()]),
-                make,
-            )?,
+        let list = match &identity {
+            Some(identity) => {
+                let key = cache::key(&[b"list", &photo.key, identity.as_bytes()]);
+                cache.get("masks", &key, make)?
+            }
             None => make()?,
         };
-        if photo.removed_k1 != 0.0 && config.eyes.segmenter == SegmenterKind::Import {
-            // Imported masks show the photo before its additional distortion was removed.
-            list = list.undistorted(
-                &photo.camera,
-                &Distortion {
-                    k1: photo.removed_k1,
-                    ..Distortion::default()
-                },
-            );
-        }
-        list.masks
-            .retain(|mask| config.eyes.keeps(mask.level) && mask.runs.area() > 0);
-        list.save(&folder.masks_path(name))?;
+        let list = kept_masks(config, photo, list);
+        list.save(&folder.masks_path(&photo.camera.name))?;
         work.advance()?;
         Ok(Level::ALL.map(|level| list.count(level)))
     };
@@ -90,4 +78,19 @@ pub(super) fn segment(
         .map(|level| (level.name().to_owned(), mean(level as usize)))
         .collect();
     Ok((counts.iter().flatten().sum(), means))
+}
+
+/// Returns the masks of a photo that are kept, in the pixels of the prepared photo.
+fn kept_masks(config: &PreprocessConfig, photo: &PreparedPhoto, mut list: MaskList) -> MaskList {
+    if photo.removed_k1 != 0.0 && config.eyes.segmenter == SegmenterKind::Import {
+        // Imported masks show the photo before its additional distortion was removed.
+        let distortion = Distortion {
+            k1: photo.removed_k1,
+            ..Distortion::default()
+        };
+        list = list.undistorted(&photo.camera, &distortion);
+    }
+    list.masks
+        .retain(|mask| config.eyes.keeps(mask.level) && mask.runs.area() > 0);
+    list
 }

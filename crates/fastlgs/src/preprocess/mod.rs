@@ -83,7 +83,7 @@ pub(crate) fn preprocess_locked(
     let holdout = held_out(config, &dataset, &given)?;
     let mut photos = stage.prepare_photos(&mut dataset)?;
     let placed = stage.place_photos(&mut photos)?;
-    let mut manifest = stage.manifest(&models, holdout, &dataset, &placed);
+    let manifest = stage.manifest(&models, holdout, &dataset, &placed);
     photos::color_points(&mut dataset, &photos, &stage.folder)?;
     let (kept, training) = training_photos(config, photos, &placed, &manifest)?;
     let (masks, masks_per_photo) = masks::segment(
@@ -102,45 +102,11 @@ pub(crate) fn preprocess_locked(
         crate::masks::compute_descriptors(folder, cameras, encoder.as_ref(), None, run)?;
         stage.laps.end("embeddings");
     }
-    manifest.warnings.clone_from(&stage.warnings);
-    manifest.seconds = stage.laps.seconds.clone();
-    let brightness_spread_stops = found.brightness.spread_stops;
-    let notes = SceneNotes {
-        brightness: Some(found.brightness),
-        ..SceneNotes::default()
-    };
-    notes.store(&mut manifest)?;
-    // Training writes the object maps in place, so the manifest lists them now.
-    let maps = found
-        .cameras
-        .iter()
-        .map(|camera| SceneFolder::objects_name(&camera.name));
-    staged.publish(&scene, &REPLACED, maps, &manifest)?;
-    // Checkpoints of a training on other photos are invalid.
-    checkpoints::remove_all(&scene);
-    stage.cache.tidy();
-    let cameras = &placed.cameras;
-    let cached = stage.cache.counts().into_iter();
+    stage.publish(staged, &scene, manifest, &found)?;
     Ok(PreprocessReport {
-        scene: config.output.clone(),
-        photos: cameras.len(),
-        training_photos: found.cameras.len(),
-        held_out: cameras.len() - found.cameras.len(),
-        size: format!("{}x{}", cameras[0].width, cameras[0].height),
         masks,
         masks_per_photo,
-        key_point_matches: found.key_point_matches,
-        points: found.points,
-        sift: keypoints::backend().to_owned(),
-        moved_cameras: placed.checked.moved.len(),
-        adjusted: placed.adjusted,
-        warnings: stage.warnings,
-        brightness_spread_stops,
-        cached: cached
-            .map(|(name, counts)| (name.to_owned(), counts))
-            .collect(),
-        seconds_total: stage.laps.started.elapsed().as_secs_f64(),
-        seconds: stage.laps.seconds,
+        ..stage.report(placed, found)
     })
 }
 
@@ -171,6 +137,12 @@ fn extract_frames(
         photos,
         ..config.clone()
     })
+}
+
+/// Reports a warning, and keeps it for the report and the manifest.
+fn warn(run: &Run, warnings: &mut Vec<String>, text: String) {
+    run.warn(&text);
+    warnings.push(text);
 }
 
 /// Seconds of each step.
@@ -250,6 +222,57 @@ struct Stage<'a> {
 }
 
 impl Stage<'_> {
+    /// Moves the staged output to the scene folder.
+    fn publish(
+        &self,
+        staged: StagedOutput,
+        scene: &SceneFolder,
+        mut manifest: Manifest,
+        found: &TrainingData,
+    ) -> Result<()> {
+        manifest.warnings.clone_from(&self.warnings);
+        manifest.seconds = self.laps.seconds.clone();
+        let notes = SceneNotes {
+            brightness: Some(found.brightness.clone()),
+            ..SceneNotes::default()
+        };
+        notes.store(&mut manifest)?;
+        // Training writes the object maps in place, so the manifest lists them now.
+        let cameras = found.cameras.iter();
+        let maps = cameras.map(|camera| SceneFolder::objects_name(&camera.name));
+        staged.publish(scene, &REPLACED, maps, &manifest)?;
+        // Checkpoints of a training on other photos are invalid.
+        checkpoints::remove_all(scene);
+        self.cache.tidy();
+        Ok(())
+    }
+
+    /// Returns the report, without the numbers of masks.
+    fn report(self, placed: Placed, found: TrainingData) -> PreprocessReport {
+        let cameras = &placed.cameras;
+        let cached = self.cache.counts().into_iter();
+        PreprocessReport {
+            scene: self.config.output.clone(),
+            photos: cameras.len(),
+            training_photos: found.cameras.len(),
+            held_out: cameras.len() - found.cameras.len(),
+            size: format!("{}x{}", cameras[0].width, cameras[0].height),
+            key_point_matches: found.key_point_matches,
+            points: found.points,
+            sift: keypoints::backend().to_owned(),
+            moved_cameras: placed.checked.moved.len(),
+            adjusted: placed.adjusted,
+            warnings: self.warnings,
+            brightness_spread_stops: found.brightness.spread_stops,
+            cached: cached
+                .map(|(name, counts)| (name.to_owned(), counts))
+                .collect(),
+            seconds_total: self.laps.started.elapsed().as_secs_f64(),
+            seconds: self.laps.seconds,
+            ..PreprocessReport::default()
+        }
+    }
+
     /// Reads photos and poses. Missing poses are computed.
     fn read_dataset(&mut self, scene: &SceneFolder) -> Result<Dataset> {
         let photos = &self.config.photos;

@@ -15,7 +15,7 @@ use fastlgs_sfm::photo_quality::{self, PhotoStats};
 use glam::Vec2;
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// A prepared photo: undistorted and scaled.
 pub struct Photo {
@@ -139,26 +139,17 @@ pub(super) fn check_masks(
             photos.len()
         );
     }
+    let unused = "have masks that ignore every pixel, so that training does not use them";
+    let invisible = "are fully transparent and show only the background";
     for (list, what) in [
-        (
-            nothing,
-            "have masks that ignore every pixel, so that training does not use them",
-        ),
+        (nothing, unused),
         (everything, "have masks that ignore no pixel"),
-        (
-            transparent,
-            "are fully transparent and show only the background",
-        ),
+        (transparent, invisible),
     ] {
         if !list.is_empty() {
-            let warning = format!(
-                "{} of {} photos {what}: {}",
-                list.len(),
-                photos.len(),
-                list.join(", ")
-            );
-            run.warn(&warning);
-            warnings.push(warning);
+            let (count, all, names) = (list.len(), photos.len(), list.join(", "));
+            let warning = format!("{count} of {all} photos {what}: {names}");
+            super::warn(run, warnings, warning);
         }
     }
     Ok(())
@@ -252,7 +243,7 @@ fn prepare(
         camera,
         pixels,
         alpha,
-        mask_extent: drawn,
+        mask_extent,
         ..
     }: Photo,
     cache: &Cache,
@@ -280,7 +271,7 @@ fn prepare(
     let colors = points.positions.iter().map(color).collect();
     Ok(PreparedPhoto {
         stats: PhotoStats::of(&pixels),
-        mask_extent: drawn,
+        mask_extent,
         opaque,
         camera,
         key,
@@ -415,29 +406,32 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
         }
     };
     let (pixels, alpha) = resampled(&raw, alpha.as_ref(), color, mask);
-    let (mut ignore, mut drawn) = (None, None);
-    if let Some(path) = &posed.ignore {
-        let own = MaskImage::load(path)?;
-        if !has_same_proportions((own.width, own.height), raw.dimensions()) {
-            let (width, height) = raw.dimensions();
-            bail!(
-                "{}: the mask is {}x{}, but its photo is {width}x{height}; check whether it was rotated or cropped",
-                path.display(),
-                own.width,
-                own.height
-            );
-        }
-        drawn = Some(Extent::of(own.area(), own.inside.len()));
-        ignore = Some(mask(&own.to_gray()));
-    }
+    let own = posed.ignore.as_deref();
+    let own = own.map(|path| ignore_mask(path, raw.dimensions()));
+    let own = own.transpose()?;
+    let ignore = own.as_ref().map(|own| mask(&own.to_gray()));
     let ignore = intersect_masks(ignore, coverage_mask(&camera, &posed.distortion));
     Ok(Photo {
         pixels,
         alpha,
         ignore,
-        mask_extent: drawn,
+        mask_extent: own.map(|own| Extent::of(own.area(), own.inside.len())),
         camera,
     })
+}
+
+/// Loads the ignore mask of a photo of this size.
+fn ignore_mask(path: &Path, (width, height): (u32, u32)) -> Result<MaskImage> {
+    let mask = MaskImage::load(path)?;
+    if !has_same_proportions((mask.width, mask.height), (width, height)) {
+        bail!(
+            "{}: the mask is {}x{}, but its photo is {width}x{height}; check whether it was rotated or cropped",
+            path.display(),
+            mask.width,
+            mask.height
+        );
+    }
+    Ok(mask)
 }
 
 /// Returns whether two sizes have the same proportions within 2 %, which allows for rounding.

@@ -213,6 +213,22 @@ fn report_line(work: &Work, stage: &str, line: &str) -> bool {
 /// these pixels. Coarse key points of small photos match across wide baselines.
 const CHECK_SIDE: u32 = 480;
 
+/// Returns the key points of the photos in the sizes of `cameras`; detects them if the photos are
+/// larger.
+fn points_for_check(
+    photos: &[PreparedPhoto],
+    cameras: &[Camera],
+    folder: &SceneFolder,
+    run: &Run,
+) -> Result<Vec<Keypoints>> {
+    let mut pairs = photos.iter().zip(cameras);
+    if pairs.any(|(photo, camera)| photo.camera.width != camera.width) {
+        detect_small(folder, cameras, run)
+    } else {
+        Ok(photos.iter().map(|p| p.points.clone()).collect())
+    }
+}
+
 /// Verifies the poses by key points, and moves groups of cameras that contradict the others. If
 /// many poses are wrong, all poses are computed again. Held-out photos take part, as in structure
 /// from motion.
@@ -239,32 +255,20 @@ pub(super) fn check(
     let detected = OnceCell::new();
     let points = || -> Result<&Vec<Keypoints>> {
         if detected.get().is_none() {
-            let small = photos
-                .iter()
-                .zip(&given)
-                .any(|(p, c)| p.camera.width != c.width);
-            let found = if small {
-                detect_small(folder, &given, run)?
-            } else {
-                photos.iter().map(|p| p.points.clone()).collect()
-            };
-            let _ = detected.set(found);
+            let _ = detected.set(points_for_check(photos, &given, folder, run)?);
         }
         Ok(detected.get().expect("set above"))
     };
-    let poses = |cameras: &[Camera]| {
-        cameras
-            .iter()
-            .map(|c| c.world_to_camera)
-            .collect::<Vec<_>>()
+    let poses = |cameras: &[Camera]| -> Vec<glam::Mat4> {
+        cameras.iter().map(|c| c.world_to_camera).collect()
     };
     let (mut report, mut corrected_poses) = cache.get("poses", &key, || {
         let mut cameras = given.clone();
         let report = pose_check::repair(&mut cameras, points()?, run.seed);
         Ok((report, poses(&cameras)))
     })?;
-    if wrong_pose_count(&report) > 0 && wrong_pose_count(&report) * WRONG_POSES_RATIO >= given.len()
-    {
+    let wrong = wrong_pose_count(&report);
+    if wrong > 0 && wrong * WRONG_POSES_RATIO >= given.len() {
         let anew = cache.get("poses anew", &key, || {
             let found = recompute_poses(&given, points()?, &report, folder, run)?;
             Ok(found.map(|(cameras, report)| (report, poses(&cameras))))
@@ -276,8 +280,7 @@ pub(super) fn check(
                 let warning = format!(
                     "many poses contradict the photos, but computing all poses again failed: {error}; only single groups of cameras are corrected"
                 );
-                run.warn(&warning);
-                warnings.push(warning);
+                super::warn(run, warnings, warning);
             }
             Err(error) => return Err(error),
         }
@@ -482,6 +485,12 @@ const MAX_CORNER_SHIFT: f32 = 1.0;
 /// error of exact poses falls slightly, too, because adjustment also fits the noise of key points.
 const MAX_ERROR_RATIO: f32 = 0.9;
 
+/// Returns by how many pixels a radial distortion moves the corner of a photo.
+fn corner_shift(camera: &Camera, k1: f32) -> f32 {
+    let corner = camera.ray(glam::Vec2::ZERO).truncate();
+    k1.abs() * corner.length().powi(3) * camera.fx
+}
+
 /// Runs bundle adjustment on all cameras, and removes the lens distortion that it finds. The given
 /// poses stay if they fit almost as well, unless `asked` is [`Poses::Refine`]. They may come from
 /// larger photos, and are then more exact.
@@ -497,8 +506,7 @@ pub(super) fn adjust(
         let warning = format!(
             "poses and lenses of more than {MAX_ADJUSTED_PHOTOS} photos are not adjusted, because it takes long; set 'poses' to 'refine' to adjust them"
         );
-        run.warn(&warning);
-        warnings.push(warning);
+        super::warn(run, warnings, warning);
         return Ok(None);
     }
     let mut cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
@@ -518,29 +526,18 @@ pub(super) fn adjust(
             .zip(cameras)
             .for_each(|(photo, camera)| photo.camera = camera);
     }
-    let bend = |(camera, k1): (&Camera, &f32)| {
-        let corner = camera.ray(glam::Vec2::ZERO).truncate();
-        k1.abs() * corner.length().powi(3) * camera.fx
-    };
-    let bent = photos
-        .iter()
-        .map(|p| &p.camera)
-        .zip(&report.k1)
-        .map(bend)
-        .fold(0.0, f32::max);
-    let k1 = report
-        .k1
-        .iter()
-        .copied()
-        .fold(0.0, |a: f32, b| if b.abs() > a.abs() { b } else { a });
+    let shifts = photos.iter().zip(&report.k1);
+    let bent = shifts.map(|(photo, k1)| corner_shift(&photo.camera, *k1));
+    let bent = bent.fold(0.0, f32::max);
+    let larger = |a: f32, b: f32| if b.abs() > a.abs() { b } else { a };
+    let k1 = report.k1.iter().copied().fold(0.0, larger);
     if used && bent > MAX_CORNER_SHIFT {
         super::photos::remove_distortion(photos, &report.k1, folder)?;
         let warning = format!(
             "the lens distorts the photos by {bent:.1} pixels at their corners, but the input states no such distortion; the photos were straightened, labels \
              drawn on them were not; to remove the distortion at full size, add \"k1\": {k1:.4} to transforms.json, or a radial term to COLMAP's camera model"
         );
-        run.warn(&warning);
-        warnings.push(warning);
+        super::warn(run, warnings, warning);
     }
     Ok(Some(Adjusted {
         error_before: report.error[0],

@@ -155,20 +155,35 @@ impl Inputs {
     }
 }
 
-/// Writes the trained scene, and replaces the earlier one.
+/// Writes the result to the scene folder.
 fn write(inputs: Inputs, trained: Trained, mapped: MappedObjects) -> Result<TrainReport> {
+    let staged = StagedOutput::new(&inputs.folder, "train")?;
+    mapped.grid.save(&staged.folder)?;
+    staged
+        .folder
+        .save_trained_cameras(trained.aligned.then_some(&trained.cameras))?;
+    ply::write(&staged.folder.ply_path(), &trained.scene)
+        .context("the trained scene cannot be written")?;
+    let report = report(&inputs.config, trained, mapped);
     let Inputs {
-        config,
         folder,
         mut manifest,
         mut notes,
         ..
     } = inputs;
-    let MappedObjects {
-        grid,
-        summary,
-        seconds,
-    } = mapped;
+    manifest.seconds.insert("train".to_owned(), report.seconds);
+    // The note of `make` is invalid now; `make` writes it again if it called this function.
+    notes.made = None;
+    notes.train = Some(report.clone());
+    notes.store(&mut manifest)?;
+    staged.publish(&folder, &REPLACED, [], &manifest)?;
+    objects::mark_maps_finished(&folder);
+    // Only an interrupted run needs its checkpoints.
+    checkpoints::remove_all(&folder);
+    Ok(report)
+}
+
+fn report(config: &TrainConfig, trained: Trained, mapped: MappedObjects) -> TrainReport {
     let Trained {
         scene,
         cameras,
@@ -176,21 +191,15 @@ fn write(inputs: Inputs, trained: Trained, mapped: MappedObjects) -> Result<Trai
         settings,
         ..
     } = trained;
-    let staged = StagedOutput::new(&folder, "train")?;
-    grid.save(&staged.folder)?;
-    staged
-        .folder
-        .save_trained_cameras(trained.aligned.then_some(&cameras))?;
-    ply::write(&staged.folder.ply_path(), &scene).context("the trained scene cannot be written")?;
     let [r, g, b, ..] = result.background;
-    let report = TrainReport {
-        scene: config.scene,
+    TrainReport {
+        scene: config.scene.clone(),
         preset: config.preset,
         mapping: config.mapping,
         feature_mode: config.feature_mode,
-        objects: grid.objects.len(),
-        mapping_seconds: trained.supervision_seconds + seconds,
-        mapping_summary: summary,
+        objects: mapped.grid.objects.len(),
+        mapping_seconds: trained.supervision_seconds + mapped.seconds,
+        mapping_summary: mapped.summary,
         iterations: result.iterations,
         seconds: result.seconds,
         iterations_per_second: result.iterations_per_second,
@@ -209,17 +218,7 @@ fn write(inputs: Inputs, trained: Trained, mapped: MappedObjects) -> Result<Trai
         curve: trained.curve,
         adapter: result.adapter,
         device: trained.device,
-    };
-    manifest.seconds.insert("train".to_owned(), result.seconds);
-    // The note of `make` is invalid now; `make` writes it again if it called this function.
-    notes.made = None;
-    notes.train = Some(report.clone());
-    notes.store(&mut manifest)?;
-    staged.publish(&folder, &REPLACED, [], &manifest)?;
-    objects::mark_maps_finished(&folder);
-    // Only an interrupted run needs its checkpoints.
-    checkpoints::remove_all(&folder);
-    Ok(report)
+    }
 }
 
 #[cfg(test)]

@@ -44,14 +44,8 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
         Mapping::Paper | Mapping::Global => Gaussians::default(),
     };
     let brightness = inputs.notes.brightness.clone().unwrap_or_default();
-    let settings = settings(
-        config,
-        &first,
-        &targets,
-        &inputs.manifest,
-        &brightness,
-        run.seed,
-    );
+    let manifest = &inputs.manifest;
+    let settings = settings(config, &first, &targets, manifest, &brightness, run.seed);
     let free = init::free_space(config, folder, &inputs.training, &first)?;
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
@@ -71,20 +65,10 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
         watch.on_progress(progress, trainer)
     })?;
     drop(work);
-    let ProgressWatcher {
-        curve,
-        supervision_seconds,
-        ..
-    } = watch;
+    let (curve, supervision_seconds) = (watch.curve, watch.supervision_seconds);
 
     let training = trainer.cameras();
-    let mut cameras = inputs.cameras.clone();
-    for camera in &training {
-        cameras
-            .iter_mut()
-            .filter(|c| c.name == camera.name)
-            .for_each(|c| *c = camera.clone());
-    }
+    let cameras = with_trained(&inputs.cameras, &training);
     let degree = trainer.needed_degree()?;
     let psnr_held_out = trainer.quality(&held_out, Some(degree))?;
     let scene = trainer.gaussians()?.with_sh_degree(degree);
@@ -134,6 +118,17 @@ fn initial_gaussians(
         mapper.lift(&mut first, objects)?;
     }
     Ok(first)
+}
+
+/// Returns all cameras, with those of the training views as training left them.
+fn with_trained(all: &[Camera], training: &[Camera]) -> Vec<Camera> {
+    let mut cameras = all.to_vec();
+    for camera in &mut cameras {
+        if let Some(trained) = training.iter().find(|c| c.name == camera.name) {
+            *camera = trained.clone();
+        }
+    }
+    cameras
 }
 
 /// Continues from the last checkpoint if `resume` is set.
