@@ -118,27 +118,19 @@ fn elements(path: &Path, lines: &[String]) -> Result<Vec<(String, Element)>> {
 pub fn parse(path: &Path, lines: &[String], body: &[u8]) -> Result<Gaussians> {
     let bad = |reason: String| Error::format(path, reason);
     let elements = elements(path, lines)?;
-    let mut at = 0;
     let mut tables = HashMap::new();
+    let mut rest = body;
     for (name, element) in &elements {
-        let length = element
-            .count
-            .checked_mul(element.row)
-            .filter(|length| *length <= body.len() - at);
-        let length = length.ok_or_else(|| {
+        let length = element.count.checked_mul(element.row);
+        let split = length.and_then(|length| rest.split_at_checked(length));
+        let (rows, after) = split.ok_or_else(|| {
             bad(format!(
                 "truncated: it ends before the {} announced rows of {name}; copy it again",
                 element.count
             ))
         })?;
-        tables.insert(
-            name.as_str(),
-            Table {
-                element,
-                rows: &body[at..at + length],
-            },
-        );
-        at += length;
+        tables.insert(name.as_str(), Table { element, rows });
+        rest = after;
     }
     let (Some(chunks), Some(vertices)) = (tables.get("chunk"), tables.get("vertex")) else {
         return Err(bad(

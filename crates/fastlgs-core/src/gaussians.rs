@@ -234,39 +234,17 @@ impl Gaussians {
     /// Returns a warning with the number of dropped Gaussians and the PLY columns of their invalid
     /// values.
     pub fn drop_invalid(&mut self) -> Option<String> {
-        for logit in self
-            .opacity_logits
-            .iter_mut()
-            .filter(|logit| logit.is_infinite())
-        {
+        let infinite = |logit: &&mut f32| logit.is_infinite();
+        for logit in self.opacity_logits.iter_mut().filter(infinite) {
             *logit = logit.signum() * FINITE_LOGIT;
         }
-        const NAMES: [&str; BASE_CHANNELS] = [
-            "x",
-            "y",
-            "z",
-            "scale_0",
-            "scale_1",
-            "scale_2",
-            "rot_0",
-            "rot_1",
-            "rot_2",
-            "rot_3",
-            "opacity",
-            "f_dc_0",
-            "f_dc_1",
-            "f_dc_2",
-            "feature_0",
-            "feature_1",
-            "feature_2",
-        ];
         let mut columns = std::collections::BTreeSet::new();
         let (mut kept, mut infinite, mut unrotated) = (Vec::with_capacity(self.len()), 0, 0);
         for i in 0..self.len() {
             let own = self.values(i);
             let bad = (0..BASE_CHANNELS)
                 .filter(|c| !own[*c].is_finite())
-                .map(|c| NAMES[c]);
+                .map(|c| CHANNEL_NAMES[c]);
             let rest = self
                 .rest(i)
                 .iter()
@@ -344,6 +322,27 @@ impl Gaussians {
 pub(crate) const SH_SIGNS: [f32; 15] = [
     -1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0,
 ];
+/// Names of the base channels in PLY files, in their order.
+const CHANNEL_NAMES: [&str; BASE_CHANNELS] = [
+    "x",
+    "y",
+    "z",
+    "scale_0",
+    "scale_1",
+    "scale_2",
+    "rot_0",
+    "rot_1",
+    "rot_2",
+    "rot_3",
+    "opacity",
+    "f_dc_0",
+    "f_dc_1",
+    "f_dc_2",
+    "feature_0",
+    "feature_1",
+    "feature_2",
+];
+
 /// Size of the logit that replaces an infinite one: an opacity of 0.999 or 0.001.
 const FINITE_LOGIT: f32 = 7.0;
 /// Distance from the median mean beyond which a Gaussian is an outlier, in multiples of the median

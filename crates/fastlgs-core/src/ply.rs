@@ -347,54 +347,46 @@ pub fn parse_in(
     data: &[u8],
     frame: &WorldFrame,
 ) -> Result<(Gaussians, Option<String>)> {
-    if let Some((lines, body)) =
-        header_lines(data).filter(|(lines, _)| compressed_ply::is_compressed(lines))
-    {
+    let lines = header_lines(data).filter(|(lines, _)| compressed_ply::is_compressed(lines));
+    let mut scene = if let Some((lines, body)) = lines {
         let mut scene = compressed_ply::parse(path, &lines, &data[body..])?;
-        scene
-            .means
-            .iter_mut()
-            .for_each(|mean| *mean = frame.to_local(mean.as_dvec3()));
+        for mean in &mut scene.means {
+            *mean = frame.to_local(mean.as_dvec3());
+        }
         let shift = frame.scale.ln() as f32;
         scene.log_scales.iter_mut().for_each(|s| *s -= shift);
-        let warning = scene
-            .drop_invalid()
-            .map(|dropped| format!("{}: {dropped}", path.display()));
-        return Ok((scene, warning));
-    }
+        scene
+    } else {
+        uncompressed(path, data, frame)?
+    };
+    let dropped = scene.drop_invalid();
+    let warning = dropped.map(|dropped| format!("{}: {dropped}", path.display()));
+    Ok((scene, warning))
+}
+
+/// Reads a file with one column for each number.
+fn uncompressed(path: &Path, data: &[u8], frame: &WorldFrame) -> Result<Gaussians> {
     let header = header(path, data)?;
     let table = columns(path, data, &header)?;
     let find = |name: &str| {
-        header
-            .columns
-            .iter()
-            .position(|c| c.0 == name)
-            .map(|i| table[i].as_slice())
+        let index = header.columns.iter().position(|c| c.0 == name);
+        index.map(|i| table[i].as_slice())
     };
     let required =
         |name: &str| find(name).ok_or_else(|| Error::format(path, missing_column(&header, name)));
-    let vec3 = |a: &[f64], b: &[f64], c: &[f64]| -> Vec<Vec3> {
-        a.iter()
-            .zip(b)
-            .zip(c)
-            .map(|((a, b), c)| Vec3::new(*a as f32, *b as f32, *c as f32))
-            .collect()
+    let all_of = |names: [&str; 3]| -> Result<Vec<Vec3>> {
+        let [a, b, c] = names.map(required);
+        Ok(vec3(a?, b?, c?))
     };
     let n = header.count;
     let zeros = vec![0.0; n];
-    let rot = [
-        required("rot_0")?,
-        required("rot_1")?,
-        required("rot_2")?,
-        required("rot_3")?,
-    ];
     let feature = |k: usize| find(&format!("feature_{k}")).unwrap_or(&zeros);
-    let rest_columns = header
-        .columns
-        .iter()
-        .filter(|c| c.0.starts_with("f_rest_"))
-        .count();
-    let sh_degree = (0..=MAX_SH_DEGREE).find(|d| 3 * rest_len(*d) == rest_columns).ok_or_else(|| {
+    let [w, x, y, z] = ["rot_0", "rot_1", "rot_2", "rot_3"].map(required);
+    let rotation = [w?, x?, y?, z?];
+    let is_rest = |column: &&(String, _)| column.0.starts_with("f_rest_");
+    let rest_columns = header.columns.iter().filter(is_rest).count();
+    let sh_degree = (0..=MAX_SH_DEGREE).find(|d| 3 * rest_len(*d) == rest_columns);
+    let sh_degree = sh_degree.ok_or_else(|| {
         Error::format(path, format!("it has {rest_columns} columns 'f_rest_*'; SH degrees 0 to {MAX_SH_DEGREE} have 0, 9, 24 or 45"))
     })?;
     let per_color = rest_len(sh_degree);
@@ -403,42 +395,35 @@ pub fn parse_in(
         .collect::<Result<Vec<_>>>()?;
     let coefficient =
         |i: usize, k: usize| [0, 1, 2].map(|color| rest[color * per_color + k][i] as f32);
+    let coefficients = (0..n).flat_map(|i| (0..per_color).map(move |k| (i, k)));
     let (x, y, z) = (required("x")?, required("y")?, required("z")?);
     let local = |i: usize| frame.to_local(DVec3::new(x[i], y[i], z[i]));
+    let object_ids = find(OBJECT_ID).unwrap_or(&zeros);
     let mut scene = Gaussians {
         means: (0..n).map(local).collect(),
-        log_scales: vec3(
-            required("scale_0")?,
-            required("scale_1")?,
-            required("scale_2")?,
-        ),
-        rotations: (0..n).map(|i| rot.map(|r| r[i] as f32)).collect(),
+        log_scales: all_of(["scale_0", "scale_1", "scale_2"])?,
+        rotations: (0..n).map(|i| rotation.map(|r| r[i] as f32)).collect(),
         opacity_logits: required("opacity")?.iter().map(|&v| v as f32).collect(),
-        sh_dc: vec3(
-            required("f_dc_0")?,
-            required("f_dc_1")?,
-            required("f_dc_2")?,
-        ),
+        sh_dc: all_of(["f_dc_0", "f_dc_1", "f_dc_2"])?,
         sh_degree,
-        sh_rest: (0..n)
-            .flat_map(|i| (0..per_color).map(move |k| (i, k)))
+        sh_rest: coefficients
             .map(|(i, k)| coefficient(i, k).into())
             .collect(),
         features: vec3(feature(0), feature(1), feature(2)),
-        object_ids: find(OBJECT_ID)
-            .unwrap_or(&zeros)
-            .iter()
-            .map(|&v| v as u16)
-            .collect(),
+        object_ids: object_ids.iter().map(|&v| v as u16).collect(),
     };
     let shift = (1.0 / frame.scale).ln() as f32;
     if shift != 0.0 {
         scene.log_scales.iter_mut().for_each(|s| *s += shift);
     }
-    let warning = scene
-        .drop_invalid()
-        .map(|dropped| format!("{}: {dropped}", path.display()));
-    Ok((scene, warning))
+    Ok(scene)
+}
+
+/// Joins three columns.
+fn vec3(a: &[f64], b: &[f64], c: &[f64]) -> Vec<Vec3> {
+    let rows = a.iter().zip(b).zip(c);
+    rows.map(|((a, b), c)| Vec3::new(*a as f32, *b as f32, *c as f32))
+        .collect()
 }
 
 #[cfg(test)]

@@ -418,44 +418,25 @@ impl Grid {
             .collect::<Result<Vec<_>, Error>>()?;
         // Files without the tensors `overlaps` and `shown` (the `id_areas`) are valid.
         let values = |name: &str| tensors.get(name).map_or(&[][..], |t| t.1.as_slice());
-        let overlaps = values("overlaps");
-        let known = |id: &f32| id.fract() == 0.0 && (0.0..=objects.len() as f32).contains(id);
-        let is_descending_list = |list: &[f32]| {
-            list.len() > 1 && list.last() == Some(&0.0) && list.is_sorted_by(|a, b| a > b)
-        };
-        let are_lists = overlaps.iter().all(known)
-            && overlaps
-                .split_inclusive(|id| *id == 0.0)
-                .all(is_descending_list);
-        let lists = overlaps
-            .split(|id| *id == 0.0)
-            .filter(|list| !list.is_empty());
-        let lists = lists
-            .map(|list| list.iter().map(|id| *id as u16).collect())
-            .collect();
-        let grid = Self {
-            objects,
-            overlaps: Overlaps(lists),
-            id_areas: values("shown").to_vec(),
-            encoder,
-        };
-        let are_counts = grid.id_areas.iter().all(|shown| *shown >= 0.0);
-        if !are_lists
-            || !are_counts
-            || grid.objects.len() + grid.overlaps.0.len() > usize::from(u16::MAX)
-        {
+        let overlaps = parse_overlaps(values("overlaps"), objects.len());
+        let id_areas = values("shown").to_vec();
+        let areas_are_valid = id_areas.iter().all(|area| *area >= 0.0);
+        let fits = |lists: &Overlaps| objects.len() + lists.0.len() <= usize::from(u16::MAX);
+        let Some(overlaps) = overlaps.filter(|lists| areas_are_valid && fits(lists)) else {
             return Err(Error::format(
                 &path,
                 "its overlap lists do not fit the objects in grid.json; run 'fastlgs train' again",
             )
             .into());
-        }
-        if grid
-            .objects
-            .iter()
-            .zip(1..=u16::MAX)
-            .any(|(object, id)| object.id != id)
-        {
+        };
+        let grid = Self {
+            objects,
+            overlaps,
+            id_areas,
+            encoder,
+        };
+        let mut numbered = grid.objects.iter().zip(1..=u16::MAX);
+        if numbered.any(|(object, id)| object.id != id) {
             return Err(Error::format(
                 root.join("grid.json"),
                 "its object ids are not 1, 2, ...; run 'fastlgs train' again",
@@ -464,4 +445,22 @@ impl Grid {
         }
         Ok(grid)
     }
+}
+
+/// Parses lists of object ids in descending order, each followed by 0. Returns `None` for other
+/// content.
+fn parse_overlaps(values: &[f32], objects: usize) -> Option<Overlaps> {
+    let is_known = |id: &f32| id.fract() == 0.0 && (0.0..=objects as f32).contains(id);
+    let is_list = |list: &[f32]| {
+        list.len() > 1 && list.last() == Some(&0.0) && list.is_sorted_by(|a, b| a > b)
+    };
+    let mut lists = values.split_inclusive(|id| *id == 0.0);
+    if !values.iter().all(is_known) || !lists.all(is_list) {
+        return None;
+    }
+    let lists = values
+        .split(|id| *id == 0.0)
+        .filter(|list| !list.is_empty());
+    let ids = lists.map(|list| list.iter().map(|id| *id as u16).collect());
+    Some(Overlaps(ids.collect()))
 }

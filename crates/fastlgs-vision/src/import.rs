@@ -213,14 +213,9 @@ impl Import {
         match self.layout {
             Layout::Annotations => self.annotated(view).map(LoadedMasks::in_order),
             Layout::Labels => {
-                let whole = self.find(
-                    view,
-                    &[
-                        named(masks.clone(), "png"),
-                        named(masks.join("whole"), "png"),
-                    ]
-                    .concat(),
-                )?;
+                let beside = named(masks.clone(), "png");
+                let below = named(masks.join("whole"), "png");
+                let whole = self.find(view, &[beside, below].concat())?;
                 let finer = [Level::Part, Level::Subpart].map(|level| {
                     named(masks.join(level.name()), "png")
                         .into_iter()
@@ -236,44 +231,18 @@ impl Import {
                 &self.find(view, &[masks.join(stem), masks.join(view)])?,
             )?)),
             Layout::LangSplat => {
-                let path = self.find(
-                    view,
-                    &[self.photos.join(format!("language_features/{stem}_s.npy"))],
-                )?;
-                let Npy { shape, values } = npy::read(&path)?;
-                let [levels @ (1 | 4), rows, columns] = shape[..] else {
-                    return Err(Error::Invalid(format!(
-                        "{}: the array has shape {shape:?}; LangSplat's segmentations have (4, rows, columns)",
-                        path.display()
-                    )));
-                };
-                let level = |k: usize| {
-                    let own = &values[k * rows * columns..][..rows * columns];
-                    LabelMap {
-                        width: columns as u32,
-                        height: rows as u32,
-                        labels: own.iter().map(|v| (v + 1.0).max(0.0) as u16).collect(),
-                    }
-                };
-                Ok(if levels == 1 {
-                    LoadedMasks::of_maps(&[level(0)])
-                } else {
-                    LoadedMasks::of_maps(&[3, 2, 1].map(level))
-                })
+                let file = self.photos.join(format!("language_features/{stem}_s.npy"));
+                lang_splat_masks(&self.find(view, &[file])?)
             }
             Layout::GaussianGrouping => {
-                let map = LabelMap::load_with_void(
-                    &self.find(view, &named(self.photos.join("object_mask"), "png"))?,
-                )?;
+                let files = named(self.photos.join("object_mask"), "png");
+                let map = LabelMap::load_with_void(&self.find(view, &files)?)?;
                 let mut found = LoadedMasks::of_maps(&[map]);
                 // Rows of embeddings follow the labels, and a label is the same object in all
                 // photos.
-                found
-                    .list
-                    .masks
-                    .iter_mut()
-                    .zip(&found.rows)
-                    .for_each(|(mask, row)| mask.track = row.map(|r| r as u32 + 1));
+                for (mask, row) in found.list.masks.iter_mut().zip(&found.rows) {
+                    mask.track = row.map(|r| r as u32 + 1);
+                }
                 Ok(found)
             }
             Layout::SpinNerf => {
@@ -282,15 +251,11 @@ impl Import {
                     .map(|ending| named(folder.clone(), ending))
                     .concat();
                 let mask = MaskImage::load(&self.find(view, &candidates)?)?;
-                let labels = mask
-                    .inside
-                    .iter()
-                    .map(|inside| u16::from(*inside))
-                    .collect();
+                let inside = mask.inside.iter();
                 Ok(LoadedMasks::of_maps(&[LabelMap {
                     width: mask.width,
                     height: mask.height,
-                    labels,
+                    labels: inside.map(|inside| u16::from(*inside)).collect(),
                 }]))
             }
         }
@@ -540,6 +505,31 @@ pub fn best_matches(masks: &LabelMap, others: &MaskList) -> Vec<Option<usize>> {
         }
     }
     best.into_iter().skip(1).map(|b| b.1).collect()
+}
+
+/// Reads the segmentations of LangSplat: (4, rows, columns), of which the last three are subpart,
+/// part and whole, or (1, rows, columns).
+fn lang_splat_masks(path: &Path) -> Result<LoadedMasks> {
+    let Npy { shape, values } = npy::read(path)?;
+    let [levels @ (1 | 4), rows, columns] = shape[..] else {
+        return Err(Error::Invalid(format!(
+            "{}: the array has shape {shape:?}; LangSplat's segmentations have (4, rows, columns)",
+            path.display()
+        )));
+    };
+    let level = |k: usize| {
+        let own = &values[k * rows * columns..][..rows * columns];
+        LabelMap {
+            width: columns as u32,
+            height: rows as u32,
+            labels: own.iter().map(|v| (v + 1.0).max(0.0) as u16).collect(),
+        }
+    };
+    Ok(if levels == 1 {
+        LoadedMasks::of_maps(&[level(0)])
+    } else {
+        LoadedMasks::of_maps(&[3, 2, 1].map(level))
+    })
 }
 
 #[cfg(test)]

@@ -49,28 +49,41 @@ pub fn load(photos: &Path) -> Result<ParsedPoses> {
             ),
         ));
     }
-    let posed = |(file, row): (PathBuf, &[f64])| {
-        let name = file
-            .file_name()
-            .unwrap_or_default()
-            .to_string_lossy()
-            .into_owned();
-        if let Some(bad) = row[..15].iter().find(|v| !v.is_finite()) {
-            return Err(Error::format(
-                &path,
-                format!("the pose of '{name}' contains {bad}; correct that row"),
-            ));
-        }
-        let column = |k: usize| DVec3::new(row[k], row[5 + k], row[10 + k]);
-        let (down, right, back, position) = (column(0), column(1), column(2), column(3));
-        let [height, width, focal] = [row[4], row[9], row[14]].map(|v| v as f32);
-        let camera_to_world = DMat4::from_cols(
-            right.extend(0.0),
-            down.extend(0.0),
-            (-back).extend(0.0),
-            position.extend(1.0),
-        );
-        let camera = Camera {
+    let photos = files
+        .into_iter()
+        .zip(table.values.chunks_exact(17))
+        .map(|(file, row)| posed(&path, file, row))
+        .collect::<Result<_>>()?;
+    // The format defines the axes, so there is only one convention.
+    Ok(ParsedPoses {
+        photos,
+        conventions: vec![PoseConvention::C2wOpencv],
+        ..ParsedPoses::default()
+    })
+}
+
+/// Returns the photo of a row: a 3x5 matrix by rows, and two depths. The columns of the matrix are the
+/// axes down, right and back, the position, and height, width and focal length.
+fn posed(path: &Path, file: PathBuf, row: &[f64]) -> Result<PosedPhoto> {
+    if let Some(bad) = row[..15].iter().find(|v| !v.is_finite()) {
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        return Err(Error::format(
+            path,
+            format!("the pose of '{name}' contains {bad}; correct that row"),
+        ));
+    }
+    let column = |k: usize| DVec3::new(row[k], row[5 + k], row[10 + k]);
+    let (down, right, back, position) = (column(0), column(1), column(2), column(3));
+    let [height, width, focal] = [row[4], row[9], row[14]].map(|v| v as f32);
+    let camera_to_world = DMat4::from_cols(
+        right.extend(0.0),
+        down.extend(0.0),
+        (-back).extend(0.0),
+        position.extend(1.0),
+    );
+    Ok(PosedPhoto {
+        path: file,
+        camera: Camera {
             name: String::new(),
             width: width as u32,
             height: height as u32,
@@ -79,27 +92,11 @@ pub fn load(photos: &Path) -> Result<ParsedPoses> {
             cx: width / 2.0,
             cy: height / 2.0,
             world_to_camera: Mat4::IDENTITY,
-        };
-        let stated = RawPose::Matrix(camera_to_world);
-        Ok(PosedPhoto {
-            path: file,
-            camera,
-            raw_pose: stated,
-            distortion: Distortion::default(),
-            ignore: None,
-            upright: false,
-        })
-    };
-    let photos = files
-        .into_iter()
-        .zip(table.values.chunks_exact(17))
-        .map(posed)
-        .collect::<Result<_>>()?;
-    // The format defines the axes, so there is only one convention.
-    Ok(ParsedPoses {
-        photos,
-        conventions: vec![PoseConvention::C2wOpencv],
-        ..ParsedPoses::default()
+        },
+        raw_pose: RawPose::Matrix(camera_to_world),
+        distortion: Distortion::default(),
+        ignore: None,
+        upright: false,
     })
 }
 

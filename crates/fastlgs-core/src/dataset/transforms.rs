@@ -241,27 +241,7 @@ fn posed(
         )
     })?;
     let coefficient = |f: fn(&Lens) -> Option<f64>| either(f).unwrap_or(0.0) as f32;
-    let projection = match frame
-        .lens
-        .camera_model
-        .as_deref()
-        .or(shared.camera_model.as_deref())
-    {
-        None if frame.lens.is_fisheye.or(shared.is_fisheye) == Some(true) => {
-            LensProjection::Fisheye
-        }
-        None
-        | Some(
-            "PINHOLE" | "SIMPLE_PINHOLE" | "OPENCV" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE",
-        ) => LensProjection::None,
-        Some("OPENCV_FISHEYE") => LensProjection::Fisheye,
-        Some(other) => {
-            return Err(Error::format(
-                file,
-                format!("the camera_model '{other}' is not supported; undistort the photos first"),
-            ));
-        }
-    };
+    let projection = projection(file, &frame.lens, shared)?;
     let ignore = frame
         .mask_path
         .as_ref()
@@ -293,6 +273,23 @@ fn posed(
         ignore,
         upright: false,
     })
+}
+
+/// Returns the projection of a lens. Values that it lacks are `shared` by all photos.
+fn projection(file: &Path, lens: &Lens, shared: &Lens) -> Result<LensProjection> {
+    let model = lens.camera_model.as_deref();
+    match model.or(shared.camera_model.as_deref()) {
+        None if lens.is_fisheye.or(shared.is_fisheye) == Some(true) => Ok(LensProjection::Fisheye),
+        None
+        | Some(
+            "PINHOLE" | "SIMPLE_PINHOLE" | "OPENCV" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE",
+        ) => Ok(LensProjection::None),
+        Some("OPENCV_FISHEYE") => Ok(LensProjection::Fisheye),
+        Some(other) => Err(Error::format(
+            file,
+            format!("the camera_model '{other}' is not supported; undistort the photos first"),
+        )),
+    }
 }
 
 /// Returns the mask of a frame: the file with the longest trailing part of the path `mask`. The

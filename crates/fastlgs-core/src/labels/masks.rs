@@ -50,45 +50,9 @@ pub fn three_d_ovs(folder: &Path) -> Result<Vec<LabelledView>> {
     let mut seen = vec![false; classes.len()];
     let mut out = Vec::new();
     for path in views {
-        let mut pictures: Vec<PathBuf> = std::fs::read_dir(&path)
-            .map_err(Error::io(&path))?
-            .flatten()
-            .map(|e| e.path())
-            .collect();
-        pictures.retain(|p| p.extension().is_some_and(|e| e == "png"));
-        pictures.sort();
-        let name = path
-            .file_name()
-            .unwrap_or_default()
-            .to_string_lossy()
-            .into_owned();
-        let mut view = LabelledView {
-            name,
-            width: 0,
-            height: 0,
-            labels: Vec::new(),
-        };
-        for picture in pictures {
-            let category = stem(&picture);
-            let class = classes.iter().position(|c| *c == category);
-            let class = class.ok_or_else(|| {
-                Error::format(
-                    &picture,
-                    format!("'{category}' is not a class in {}", list.display()),
-                )
-            })?;
-            let (size, region) = mask(&picture)?;
-            if !view.labels.is_empty() && size != (view.width, view.height) {
-                return Err(Error::format(
-                    &picture,
-                    "its size differs from that of the view's other masks",
-                ));
-            }
-            (view.width, view.height) = size;
-            if let Some(region) = region {
-                seen[class] = true;
-                view.labels.push(Label { category, region });
-            }
+        let view = view_of_classes(&path, &list, &classes)?;
+        for (class, seen) in classes.iter().zip(&mut seen) {
+            *seen |= view.labels.iter().any(|label| label.category == *class);
         }
         out.push(view);
     }
@@ -99,6 +63,40 @@ pub fn three_d_ovs(folder: &Path) -> Result<Vec<LabelledView>> {
         )),
         _ => Ok(out),
     }
+}
+
+/// Reads the folder of a view, which has a mask for each class that the view shows.
+fn view_of_classes(path: &Path, list: &Path, classes: &[&str]) -> Result<LabelledView> {
+    let entries = std::fs::read_dir(path).map_err(Error::io(path))?;
+    let mut pictures: Vec<PathBuf> = entries.flatten().map(|e| e.path()).collect();
+    pictures.retain(|p| p.extension().is_some_and(|e| e == "png"));
+    pictures.sort();
+    let name = path.file_name().unwrap_or_default();
+    let mut view = LabelledView {
+        name: name.to_string_lossy().into_owned(),
+        width: 0,
+        height: 0,
+        labels: Vec::new(),
+    };
+    for picture in pictures {
+        let category = stem(&picture);
+        if !classes.contains(&category.as_str()) {
+            let reason = format!("'{category}' is not a class in {}", list.display());
+            return Err(Error::format(&picture, reason));
+        }
+        let (size, region) = mask(&picture)?;
+        if !view.labels.is_empty() && size != (view.width, view.height) {
+            return Err(Error::format(
+                &picture,
+                "its size differs from that of the view's other masks",
+            ));
+        }
+        (view.width, view.height) = size;
+        if let Some(region) = region {
+            view.labels.push(Label { category, region });
+        }
+    }
+    Ok(view)
 }
 
 /// Reads labels of SPIn-NeRF: each image is the mask of the one labelled object in the view of the
