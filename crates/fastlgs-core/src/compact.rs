@@ -211,11 +211,9 @@ pub fn read(path: &Path) -> Result<Gaussians> {
     let file = SafeTensors::deserialize(&data)
         .map_err(|e| bad(format!("not a complete safetensors file ({e})")))?;
     let tensor = |name: &str, dtype: Dtype, rank: usize| {
-        let found = file
-            .tensor(name)
-            .ok()
-            .filter(|t| t.dtype() == dtype && t.shape().len() == rank);
-        found.ok_or_else(|| {
+        let found = file.tensor(name).ok();
+        let fitting = found.filter(|t| t.dtype() == dtype && t.shape().len() == rank);
+        fitting.ok_or_else(|| {
             bad(format!(
                 "no tensor '{name}' of type {dtype:?} with {rank} dimensions"
             ))
@@ -259,14 +257,11 @@ pub fn read(path: &Path) -> Result<Gaussians> {
             if n > 0 && !(fixed.low.is_finite() && fixed.high.is_finite()) {
                 return Err(bad(format!("the range of '{name}' is not finite")));
             }
-            for (i, value) in values[channel * n..(channel + 1) * n]
-                .iter_mut()
-                .enumerate()
-            {
-                let steps = (0..bytes).fold(0u32, |s, b| {
-                    s << 8 | u32::from(planes.data()[(k * bytes + b) * n + i])
-                });
-                *value = fixed.value(steps);
+            let planes = &planes.data()[k * bytes * n..];
+            let own = &mut values[channel * n..(channel + 1) * n];
+            for (i, value) in own.iter_mut().enumerate() {
+                let byte = |steps: u32, b: usize| steps << 8 | u32::from(planes[b * n + i]);
+                *value = fixed.value((0..bytes).fold(0, byte));
             }
         }
     }

@@ -65,26 +65,12 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
             data.extend(&((value * unit).round() as i32).to_le_bytes()[..3]);
         }
     }
-    data.extend(
-        scene
-            .opacity_logits
-            .iter()
-            .map(|o| byte(sigmoid(*o) * 255.0)),
-    );
-    data.extend(
-        scene
-            .sh_dc
-            .iter()
-            .flat_map(|c| c.to_array())
-            .map(|c| byte(c * COLOR_SCALE * 255.0 + 127.5)),
-    );
-    data.extend(
-        scene
-            .log_scales
-            .iter()
-            .flat_map(|s| s.to_array())
-            .map(|s| byte((s + 10.0) * 16.0)),
-    );
+    let opacities = scene.opacity_logits.iter();
+    data.extend(opacities.map(|o| byte(sigmoid(*o) * 255.0)));
+    let colors = scene.sh_dc.iter().flat_map(|c| c.to_array());
+    data.extend(colors.map(|c| byte(c * COLOR_SCALE * 255.0 + 127.5)));
+    let scales = scene.log_scales.iter().flat_map(|s| s.to_array());
+    data.extend(scales.map(|s| byte((s + 10.0) * 16.0)));
     for i in 0..scene.len() {
         let q = scene.rotation(i);
         let sign = if q.w < 0.0 { -1.0 } else { 1.0 };

@@ -89,25 +89,7 @@ pub fn choose(
     config: &SelectionConfig,
 ) -> Chosen {
     let mut chosen = Chosen::default();
-    let mut left: Vec<(Proposal, Support)> = Vec::new();
-    for (set, s) in sets.into_iter().zip(support) {
-        match [s.areas.len() < config.min_views, s.iou < config.min_support]
-            .iter()
-            .position(|bad| *bad)
-        {
-            Some(reason) => chosen.dropped[reason] += 1,
-            None => left.push((set, s)),
-        }
-    }
-    left.sort_by(|(a, of_a), (b, of_b)| {
-        of_b.iou.total_cmp(&of_a.iou).then_with(|| {
-            a.masks
-                .iter()
-                .map(|f| f.mask)
-                .cmp(b.masks.iter().map(|f| f.mask))
-        })
-    });
-
+    let left = supported(sets, support, config, &mut chosen.dropped);
     let weights: Vec<f32> = (0..observations.gaussians() as u32)
         .map(|g| observations.weight(g))
         .collect();
@@ -140,11 +122,8 @@ pub fn choose(
         holders.add(place, &set.set);
     }
     let list = |objects: Vec<u32>| {
-        objects
-            .into_iter()
-            .rev()
-            .map(|place| place as u16 + 1)
-            .collect()
+        let places = objects.into_iter().rev();
+        places.map(|place| place as u16 + 1).collect()
     };
     let lists: Vec<Vec<u16>> = holders.of.into_iter().map(list).collect();
     (chosen.overlaps, chosen.ids) =
@@ -158,6 +137,32 @@ pub fn choose(
         .sums(chosen.parents.len(), &chosen.ids, &shown);
     chosen.support = objects.into_iter().map(|o| o.2).collect();
     chosen
+}
+
+/// Returns the sets that enough views show with enough support, in descending order of support.
+/// Counts the others by reason.
+fn supported(
+    sets: Vec<Proposal>,
+    support: Vec<Support>,
+    config: &SelectionConfig,
+    dropped: &mut [usize; 3],
+) -> Vec<(Proposal, Support)> {
+    let mut left: Vec<(Proposal, Support)> = Vec::new();
+    for (set, support) in sets.into_iter().zip(support) {
+        if support.areas.len() < config.min_views {
+            dropped[0] += 1;
+        } else if support.iou < config.min_support {
+            dropped[1] += 1;
+        } else {
+            left.push((set, support));
+        }
+    }
+    left.sort_by(|(a, of_a), (b, of_b)| {
+        let masks = |set: &Proposal| set.masks.iter().map(|f| f.mask).collect::<Vec<_>>();
+        let by_support = of_b.iou.total_cmp(&of_a.iou);
+        by_support.then_with(|| masks(a).cmp(&masks(b)))
+    });
+    left
 }
 
 /// For each Gaussian, the sets that contain it, in order of insertion.

@@ -68,15 +68,9 @@ impl Overlaps {
                 .max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)))
                 .map_or(0, |other| other.1)
         };
-        let of_list: BTreeMap<&[u16], u16> = order
-            .iter()
-            .map(|(list, _)| {
-                (
-                    *list,
-                    number.get(list).copied().unwrap_or_else(|| nearest(list)),
-                )
-            })
-            .collect();
+        let id = |list| number.get(list).copied().unwrap_or_else(|| nearest(list));
+        let of_list: BTreeMap<&[u16], u16> =
+            order.iter().map(|(list, _)| (*list, id(*list))).collect();
         let ids = lists
             .iter()
             .map(|list| of_list.get(list.as_slice()).copied().unwrap_or(0))

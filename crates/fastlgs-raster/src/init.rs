@@ -93,6 +93,19 @@ const RADIUS_FACTOR: f32 = 2.0;
 /// pixels.
 const BACKDROP_OPACITY: f32 = 0.9;
 
+/// Returns the radius of the backdrop: all but `OUTSIDE_SHARE` of the points lie within it, and all
+/// cameras with a margin.
+fn backdrop_radius(cameras: &[Camera], points: &[SfmPoint], focus: Vec3) -> f32 {
+    let distances = points.iter().map(|point| point.position.distance(focus));
+    let mut distances: Vec<f32> = distances.collect();
+    distances.sort_by(f32::total_cmp);
+    let of_cameras = cameras.iter().map(|camera| camera.centre().distance(focus));
+    let min_radius = RADIUS_FACTOR * of_cameras.fold(0.0, f32::max);
+    distances
+        .get(((1.0 - OUTSIDE_SHARE) * distances.len() as f32) as usize)
+        .map_or(min_radius, |farthest| farthest.max(min_radius))
+}
+
 /// Returns a backdrop for few photos: at most `max_count` nearly opaque Gaussians on a sphere.
 ///
 /// The sphere surrounds the common focus, all cameras, and all but a few of `points`. Its Gaussians
@@ -105,20 +118,7 @@ const BACKDROP_OPACITY: f32 = 0.9;
 /// When a photo cannot be read.
 pub fn backdrop(views: &Targets, points: &[SfmPoint], max_count: usize) -> Result<Gaussians> {
     let focus = common_focus(&views.cameras);
-    let mut distances: Vec<f32> = points
-        .iter()
-        .map(|point| point.position.distance(focus))
-        .collect();
-    distances.sort_by(f32::total_cmp);
-    let min_radius = RADIUS_FACTOR
-        * views
-            .cameras
-            .iter()
-            .map(|camera| camera.centre().distance(focus))
-            .fold(0.0, f32::max);
-    let radius = distances
-        .get(((1.0 - OUTSIDE_SHARE) * distances.len() as f32) as usize)
-        .map_or(min_radius, |farthest| farthest.max(min_radius));
+    let radius = backdrop_radius(&views.cameras, points, focus);
     let mut scene = Gaussians::default();
     for id in 0..views.len() {
         let Target { camera, image, .. } = views.get(id)?;

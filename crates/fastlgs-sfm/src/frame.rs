@@ -30,19 +30,12 @@ pub fn align(
     found: &[Option<Mat4>],
     seed: u64,
 ) -> Option<(Vec<Camera>, BTreeSet<usize>)> {
-    let placed: Vec<(usize, Camera)> = found
-        .iter()
-        .enumerate()
-        .filter_map(|(photo, pose)| {
-            Some((
-                photo,
-                Camera {
-                    world_to_camera: (*pose)?,
-                    ..given[photo].clone()
-                },
-            ))
-        })
-        .collect();
+    let with_pose = |(photo, pose): (usize, &Option<Mat4>)| {
+        let mut camera = given[photo].clone();
+        camera.world_to_camera = (*pose)?;
+        Some((photo, camera))
+    };
+    let placed: Vec<(usize, Camera)> = found.iter().enumerate().filter_map(with_pose).collect();
     if placed.len() < MIN_AGREEING {
         return None;
     }
@@ -63,11 +56,8 @@ pub fn align(
             .collect()
     };
     let between = |some: &[usize]| {
-        let pairs: Vec<_> = some
-            .iter()
-            .map(|&k| (placed[k].1.centre(), given[placed[k].0].centre()))
-            .collect();
-        Similarity::between(&pairs)
+        let pair = |&k: &usize| (placed[k].1.centre(), given[placed[k].0].centre());
+        Similarity::between(&some.iter().map(pair).collect::<Vec<_>>())
     };
     let mut rng = Rng::new(seed, "frame");
     let mut best = Vec::new();

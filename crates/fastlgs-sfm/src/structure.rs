@@ -179,12 +179,8 @@ fn by_program(
         .filter_map(|file| image_io::dimensions(file).ok())
         .collect();
     let single = if sizes.len() <= 1 { "1" } else { "0" };
-    let one_camera = [
-        "--ImageReader.single_camera",
-        single,
-        "--ImageReader.camera_model",
-        CAMERA_MODEL,
-    ];
+    let (is_single, model) = ("--ImageReader.single_camera", "--ImageReader.camera_model");
+    let one_camera = [is_single, single, model, CAMERA_MODEL];
     let stages: [(&str, &str, &[&str]); 3] = [
         ("features", "feature_extractor", &one_camera),
         ("matches", matcher, &[]),

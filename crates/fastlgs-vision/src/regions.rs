@@ -12,17 +12,7 @@ pub fn watershed(edges: &[f32], width: usize, height: usize) -> (Vec<u32>, usize
         .iter()
         .map(|e| (e.clamp(0.0, 1.0) * 255.0) as u32)
         .collect();
-    let near = |p: usize| {
-        let (x, y) = (p % width, p / width);
-        [
-            (x > 0).then(|| p - 1),
-            (x + 1 < width).then(|| p + 1),
-            (y > 0).then(|| p - width),
-            (y + 1 < height).then(|| p + width),
-        ]
-        .into_iter()
-        .flatten()
-    };
+    let near = |p: usize| neighbours(p, width, height);
     let mut basin = vec![NONE; level.len()];
     let mut count = 0;
     let mut stack = Vec::new();
@@ -70,6 +60,19 @@ pub fn watershed(edges: &[f32], width: usize, height: usize) -> (Vec<u32>, usize
         }
     }
     (basin, count as usize)
+}
+
+/// Returns the neighbours of a pixel: left, right, above and below.
+fn neighbours(p: usize, width: usize, height: usize) -> impl Iterator<Item = usize> {
+    let (x, y) = (p % width, p / width);
+    [
+        (x > 0).then(|| p - 1),
+        (x + 1 < width).then(|| p + 1),
+        (y > 0).then(|| p - width),
+        (y + 1 < height).then(|| p + width),
+    ]
+    .into_iter()
+    .flatten()
 }
 
 /// A node of the merge tree: a basin or the union of two nodes.

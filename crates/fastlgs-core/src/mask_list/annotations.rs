@@ -289,37 +289,11 @@ fn coco<'a>(
     check_size(path, width, height)?;
     let mut list = MaskList::new(width, height);
     for (k, annotation) in annotations.enumerate() {
-        let runs = match &annotation.segmentation {
-            Segmentation::Runs { size, .. } if *size != [height, width] => {
-                return Err(Error::format(
-                    path,
-                    format!(
-                        "mask {k} has {}x{} pixels, but the first mask has {width}x{height}; export all masks in one size",
-                        size[1], size[0]
-                    ),
-                ));
-            }
-            Segmentation::Runs { counts, .. } => {
-                let pixels = u64::from(width) * u64::from(height);
-                let runs = match counts {
-                    Counts::Text(text) => RunLengths::from_text(text, pixels),
-                    Counts::Numbers(counts) => RunLengths::from_counts(counts.clone(), pixels),
-                };
-                runs.ok_or_else(|| Error::format(path, format!("the run lengths of mask {k} do not add up to {width}x{height} pixels; export it again")))?
-            }
-            Segmentation::Polygons(polygons) => {
-                let corners = |flat: &Vec<f64>| flat.as_chunks::<2>().0.to_vec();
-                rasterize_union(
-                    &polygons.iter().map(corners).collect::<Vec<_>>(),
-                    width,
-                    height,
-                )
-            }
-        };
-        let track = annotation.track_id.as_ref().or(annotation
-            .attributes
-            .as_ref()
-            .and_then(|a| a.track_id.as_ref()));
+        let runs = runs_of(&annotation.segmentation, width, height)
+            .map_err(|reason| Error::format(path, format!("mask {k} {reason}")))?;
+        let attributes = annotation.attributes.as_ref();
+        let track = annotation.track_id.as_ref();
+        let track = track.or(attributes.and_then(|a| a.track_id.as_ref()));
         list.masks.push(Mask {
             level: annotation.level.unwrap_or_default(),
             predicted_iou: annotation.predicted_iou.unwrap_or(1.0),
@@ -329,6 +303,33 @@ fn coco<'a>(
         });
     }
     Ok(list)
+}
+
+/// Returns the pixels of an annotation in a photo of this size, or why they cannot be read.
+fn runs_of(segmentation: &Segmentation, width: u32, height: u32) -> Result<RunLengths, String> {
+    match segmentation {
+        Segmentation::Runs { size, .. } if *size != [height, width] => Err(format!(
+            "has {}x{} pixels, but the first mask has {width}x{height}; export all masks in one size",
+            size[1], size[0]
+        )),
+        Segmentation::Runs { counts, .. } => {
+            let pixels = u64::from(width) * u64::from(height);
+            let runs = match counts {
+                Counts::Text(text) => RunLengths::from_text(text, pixels),
+                Counts::Numbers(counts) => RunLengths::from_counts(counts.clone(), pixels),
+            };
+            runs.ok_or_else(|| {
+                format!(
+                    "has run lengths that do not add up to {width}x{height} pixels; export it again"
+                )
+            })
+        }
+        Segmentation::Polygons(polygons) => {
+            let corners = |flat: &Vec<f64>| flat.as_chunks::<2>().0.to_vec();
+            let polygons: Vec<_> = polygons.iter().map(corners).collect();
+            Ok(rasterize_union(&polygons, width, height))
+        }
+    }
 }
 
 /// Returns the id of a track: its number, or the 32-bit FNV-1a hash of its name. Negative numbers
@@ -498,31 +499,15 @@ fn label_studio(path: &Path, task: &Task) -> Result<MaskList> {
                 width: w,
                 height: h,
                 rotation,
-            } => {
-                let (corner, [w, h]) = (pixels([*x, *y]), pixels([*w, *h]));
-                let (sin, cos) = rotation.to_radians().sin_cos();
-                let turned = |[x, y]: [f64; 2]| {
-                    [corner[0] + cos * x - sin * y, corner[1] + sin * x + cos * y]
-                };
-                [[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]
-                    .map(turned)
-                    .to_vec()
-            }
+            } => rectangle(pixels([*x, *y]), pixels([*w, *h]), *rotation),
             Value::Brush { rle } => {
-                let alpha =
-                    decode_brush(rle).filter(|alpha| alpha.len() == (width * height) as usize);
-                let alpha = alpha.ok_or_else(|| {
+                let runs = brush(rle, width, height).ok_or_else(|| {
                     Error::format(
                         path,
                         "a brush mask cannot be decoded; export as COCO with run lengths",
                     )
                 })?;
-                list.masks.push(Mask::new(
-                    Level::Whole,
-                    RunLengths::from_fn(width, height, |x, y| {
-                        alpha[(y * width + x) as usize] > 127
-                    }),
-                ));
+                list.masks.push(Mask::new(Level::Whole, runs));
                 continue;
             }
             // Choices, relations and texts have no pixels.
@@ -534,6 +519,22 @@ fn label_studio(path: &Path, task: &Task) -> Result<MaskList> {
         ));
     }
     Ok(list)
+}
+
+/// Returns the corners of a rectangle that is rotated around its first corner, in degrees.
+fn rectangle(corner: [f64; 2], [w, h]: [f64; 2], rotation: f64) -> Vec<[f64; 2]> {
+    let (sin, cos) = rotation.to_radians().sin_cos();
+    let turned = |[x, y]: [f64; 2]| [corner[0] + cos * x - sin * y, corner[1] + sin * x + cos * y];
+    [[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]
+        .map(turned)
+        .to_vec()
+}
+
+/// Decodes a brush mask of a photo of this size.
+fn brush(rle: &[u8], width: u32, height: u32) -> Option<RunLengths> {
+    let alpha = decode_brush(rle).filter(|alpha| alpha.len() == (width * height) as usize)?;
+    let is_inside = |x, y| alpha[(y * width + x) as usize] > 127;
+    Some(RunLengths::from_fn(width, height, is_inside))
 }
 
 /// Decodes the run lengths of Label Studio's brush and returns the alpha channel; `None` if the

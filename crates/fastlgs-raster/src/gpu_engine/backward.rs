@@ -124,12 +124,8 @@ impl Slots {
                 gradient,
                 slots,
             };
-            r.run(
-                &passes.blend_backward,
-                &view,
-                of_frame,
-                gpu.shape.groups(view.tile_count()),
-            )?;
+            let groups = gpu.shape.groups(view.tile_count());
+            r.run(&passes.blend_backward, &view, of_frame, groups)?;
             if view.fold_length > 1 {
                 let folded = FoldSlotsBuffers {
                     touched,
@@ -139,12 +135,8 @@ impl Slots {
                 };
                 let pairs =
                     (view.pairs - slot_first).min(slot_count.saturating_add(view.tile_count()));
-                r.run(
-                    &passes.fold_slots,
-                    &view,
-                    folded,
-                    pairs.div_ceil(view.fold_length).div_ceil(GROUP),
-                )?;
+                let groups = pairs.div_ceil(view.fold_length).div_ceil(GROUP);
+                r.run(&passes.fold_slots, &view, folded, groups)?;
             }
             for page in &g.pages {
                 let view = View {
@@ -152,23 +144,18 @@ impl Slots {
                     page: page.n as u32,
                     ..view
                 };
-                let (params, gradients) = (&page.params, &page.gradients);
                 let of_slots = ProjectBackwardBuffers {
-                    params,
+                    params: &page.params,
                     splats,
                     order,
                     touched,
                     first_pair,
                     slots,
-                    gradients,
+                    gradients: &page.gradients,
                     stats,
                 };
-                r.run(
-                    &passes.project_backward,
-                    &view,
-                    of_slots,
-                    view.gaussians.div_ceil(GROUP),
-                )?;
+                let groups = view.gaussians.div_ceil(GROUP);
+                r.run(&passes.project_backward, &view, of_slots, groups)?;
             }
         }
         Ok(())

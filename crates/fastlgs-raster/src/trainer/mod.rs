@@ -375,18 +375,7 @@ impl Trainer {
                 started = Instant::now();
                 self.loaded_targets.read_seconds = 0.0;
             }
-            if self.training.config.refines(iteration) {
-                self.refine()?;
-            }
-            if self.training.config.resets_opacity(iteration) {
-                self.reset_opacity()?;
-            }
-            if self.training.config.aligns(iteration) {
-                self.align()?;
-            }
-            if self.training.config.prunes(iteration) {
-                self.prune()?;
-            }
+            self.run_scheduled(iteration)?;
             if iteration.is_multiple_of(20) || self.training.config.couples_at == Some(iteration) {
                 let losses = self.engine.losses()?;
                 // For normally distributed errors, mean square = pi/2 x squared mean absolute
@@ -433,6 +422,24 @@ impl Trainer {
             alignment_gain: self.training.alignment_gain,
             adapter: self.engine.name(),
         })
+    }
+
+    /// Runs the steps that are due after an iteration: density control, opacity reset, alignment and
+    /// pruning.
+    fn run_scheduled(&mut self, iteration: u32) -> Result<()> {
+        if self.training.config.refines(iteration) {
+            self.refine()?;
+        }
+        if self.training.config.resets_opacity(iteration) {
+            self.reset_opacity()?;
+        }
+        if self.training.config.aligns(iteration) {
+            self.align()?;
+        }
+        if self.training.config.prunes(iteration) {
+            self.prune()?;
+        }
+        Ok(())
     }
 
     /// Returns the current Gaussians.

@@ -172,26 +172,25 @@ pub(super) fn refined(
         across.iter().flat_map(of_link).collect()
     };
     let weight = |r: f32, width: f32| 1.0 / (1.0 + (r / width).powi(2)).powi(2);
-    let cost = |r: &[f32], width: f32| {
-        r.iter()
-            .map(|r| 1.0 - 1.0 / (1.0 + (r / width).powi(2)))
-            .sum::<f32>()
+    let cost = |r: &[f32], width: f32| -> f32 {
+        let costs = r.iter().map(|r| 1.0 - 1.0 / (1.0 + (r / width).powi(2)));
+        costs.sum()
     };
     let mut best = first;
     for loss_scale in [8.0, 8.0, 4.0, 4.0, 2.0, 2.0, 2.0, 2.0] {
         let now = residuals(&best);
         const STEP: f32 = 1e-4;
-        let slopes: Vec<Vec<f32>> = (0..7)
-            .map(|k| {
-                let mut delta = [0.0; 7];
-                delta[k] = STEP;
-                residuals(&best.followed_by_small(&delta))
-                    .iter()
-                    .zip(&now)
-                    .map(|(a, b)| (a - b) / STEP)
-                    .collect()
-            })
-            .collect();
+        let slope = |k: usize| -> Vec<f32> {
+            let mut delta = [0.0; 7];
+            delta[k] = STEP;
+            let moved = residuals(&best.followed_by_small(&delta));
+            moved
+                .iter()
+                .zip(&now)
+                .map(|(a, b)| (a - b) / STEP)
+                .collect()
+        };
+        let slopes: Vec<Vec<f32>> = (0..7).map(slope).collect();
         let (mut normal, mut right) = (SMatrix::<f64, 7, 7>::zeros(), SVector::<f64, 7>::zeros());
         for (m, r) in now.iter().enumerate() {
             let w = f64::from(weight(*r, loss_scale));

@@ -205,15 +205,12 @@ impl Repair<'_> {
             return false;
         };
         let similarity = refined(first, &across, moves, self.cameras, self.keypoints);
-        let moved: Vec<Camera> = (self.cameras.iter().enumerate())
-            .map(|(i, c)| {
-                let mut camera = c.clone();
-                if moves(i) {
-                    similarity.move_camera(&mut camera);
-                }
-                camera
-            })
-            .collect();
+        let mut moved = self.cameras.to_vec();
+        for (i, camera) in moved.iter_mut().enumerate() {
+            if moves(i) {
+                similarity.move_camera(camera);
+            }
+        }
         // Inliers of all links, and of links between consecutive photos. Repeated structures can
         // produce wrong matches between distant views.
         let obeying = |cameras: &[Camera]| {

@@ -46,6 +46,93 @@ enum Kind {
     Transformers { stretched: bool },
 }
 
+impl Kind {
+    /// Determines the kind of a decoder by its inputs.
+    fn of(decoder: &Model) -> Result<Self> {
+        let has = |name: &str| decoder.input(&[name]).is_some();
+        let finer = decoder
+            .inputs
+            .iter()
+            .any(|i| i.name.starts_with("high_res_feats") || i.name == "image_embeddings.0");
+        if has("batched_point_coords") {
+            Ok(Self::Efficient)
+        } else if has("input_points") {
+            Ok(Self::Transformers { stretched: finer })
+        } else if has("point_coords") {
+            Ok(if finer {
+                Self::Stretched
+            } else {
+                Self::Official
+            })
+        } else {
+            let names: Vec<&str> = decoder.inputs.iter().map(|i| i.name.as_str()).collect();
+            Err(decoder.error(format!(
+                "this is not a supported SAM decoder; its inputs are {}",
+                names.join(", ")
+            )))
+        }
+    }
+
+    /// Returns the names of the inputs that describe a prompt.
+    fn prompt_inputs(self) -> &'static [&'static str] {
+        match self {
+            Self::Official | Self::Stretched => &[
+                "point_coords",
+                "point_labels",
+                "mask_input",
+                "has_mask_input",
+                "orig_im_size",
+            ],
+            Self::Efficient => &[
+                "batched_point_coords",
+                "batched_point_labels",
+                "orig_im_size",
+            ],
+            Self::Transformers { .. } => &["input_points", "input_labels", "input_boxes"],
+        }
+    }
+
+    /// Returns the inputs for prompts of one point each, 0 to 1 across the photo.
+    fn prompt(self, encoded: &Encoded, points: &[[f32; 2]]) -> Vec<(&'static str, Array)> {
+        let n = points.len();
+        let [width, height] = encoded.prompt_size;
+        let on_picture = points.iter().map(|p| [p[0] * width, p[1] * height]);
+        let flat = || on_picture.clone().flatten().collect();
+        match self {
+            Self::Official | Self::Stretched => {
+                // Without a box, a padding point with label -1 follows each point.
+                let padded = on_picture.flat_map(|p| [p[0], p[1], 0.0, 0.0]);
+                let labels = (0..n).flat_map(|_| [1.0, -1.0]).collect();
+                // Size of the full-resolution masks. They are not used, so the size is kept small.
+                let [w, h] = encoded
+                    .prompt_size
+                    .map(|v| (v * MASK_SIDE as f32 / SIDE as f32).ceil());
+                let mask = vec![0.0; MASK_SIDE * MASK_SIDE];
+                vec![
+                    ("point_coords", Array::new([n, 2, 2], padded.collect())),
+                    ("point_labels", Array::new([n, 2], labels)),
+                    ("mask_input", Array::new([1, 1, MASK_SIDE, MASK_SIDE], mask)),
+                    ("has_mask_input", Array::new([1], vec![0.0])),
+                    ("orig_im_size", Array::new([2], vec![h, w])),
+                ]
+            }
+            Self::Efficient => {
+                let [w, h] = encoded.size.map(|side| side as f32);
+                vec![
+                    ("batched_point_coords", Array::new([1, n, 1, 2], flat())),
+                    ("batched_point_labels", Array::new([1, n, 1], vec![1.0; n])),
+                    ("orig_im_size", Array::new([2], vec![h, w])),
+                ]
+            }
+            Self::Transformers { .. } => vec![
+                ("input_points", Array::new([1, n, 1, 2], flat())),
+                ("input_labels", Array::new([1, n, 1], vec![1.0; n])),
+                ("input_boxes", Array::new([1, 0, 4], Vec::new())),
+            ],
+        }
+    }
+}
+
 /// An image encoder and its prompt decoder.
 pub struct Exports {
     encoder: Model,
@@ -91,48 +178,13 @@ impl Exports {
     /// The message names that input.
     pub fn load(encoder: &Path, decoder: &Path) -> Result<Self> {
         let (encoder, decoder) = (Model::load(encoder)?, Model::load(decoder)?);
-        let has = |name: &str| decoder.input(&[name]).is_some();
-        let finer = decoder
-            .inputs
-            .iter()
-            .any(|i| i.name.starts_with("high_res_feats") || i.name == "image_embeddings.0");
-        let kind = if has("batched_point_coords") {
-            Kind::Efficient
-        } else if has("input_points") {
-            Kind::Transformers { stretched: finer }
-        } else if has("point_coords") {
-            if finer {
-                Kind::Stretched
-            } else {
-                Kind::Official
-            }
-        } else {
-            let names: Vec<&str> = decoder.inputs.iter().map(|i| i.name.as_str()).collect();
-            return Err(decoder.error(format!(
-                "this is not a supported SAM decoder; its inputs are {}",
-                names.join(", ")
-            )));
-        };
+        let kind = Kind::of(&decoder)?;
         if encoder.inputs.len() != 1 {
             return Err(
                 encoder.error("this is not a SAM image encoder; it must have exactly one input")
             );
         }
-        let asked: &[&str] = match kind {
-            Kind::Official | Kind::Stretched => &[
-                "point_coords",
-                "point_labels",
-                "mask_input",
-                "has_mask_input",
-                "orig_im_size",
-            ],
-            Kind::Efficient => &[
-                "batched_point_coords",
-                "batched_point_labels",
-                "orig_im_size",
-            ],
-            Kind::Transformers { .. } => &["input_points", "input_labels", "input_boxes"],
-        };
+        let asked = kind.prompt_inputs();
         let mut passed = Vec::new();
         for input in decoder
             .inputs
@@ -243,59 +295,11 @@ impl Exports {
     /// Failed inference, or outputs that are not masks with scores.
     pub fn decode(&self, encoded: &Encoded, points: &[[f32; 2]]) -> Result<Logits> {
         let n = points.len();
-        let on_picture: Vec<[f32; 2]> = points
-            .iter()
-            .map(|p| [p[0] * encoded.prompt_size[0], p[1] * encoded.prompt_size[1]])
-            .collect();
-        let mut inputs: Vec<(&str, Array)> = encoded
-            .embeddings
-            .iter()
+        let embeddings = encoded.embeddings.iter();
+        let mut inputs: Vec<(&str, Array)> = embeddings
             .map(|(name, a)| (name.as_str(), a.clone()))
             .collect();
-        let flat = || on_picture.iter().flatten().copied();
-        match self.kind {
-            Kind::Official | Kind::Stretched => {
-                // Without a box, a padding point with label -1 follows each point.
-                let coordinates = on_picture
-                    .iter()
-                    .flat_map(|p| [p[0], p[1], 0.0, 0.0])
-                    .collect();
-                let labels = (0..n).flat_map(|_| [1.0, -1.0]).collect();
-                // Size of the full-resolution masks. They are not used, so the size is kept small.
-                let [w, h] = encoded
-                    .prompt_size
-                    .map(|v| (v * MASK_SIDE as f32 / SIDE as f32).ceil());
-                inputs.extend([
-                    ("point_coords", Array::new([n, 2, 2], coordinates)),
-                    ("point_labels", Array::new([n, 2], labels)),
-                    (
-                        "mask_input",
-                        Array::new(
-                            [1, 1, MASK_SIDE, MASK_SIDE],
-                            vec![0.0; MASK_SIDE * MASK_SIDE],
-                        ),
-                    ),
-                    ("has_mask_input", Array::new([1], vec![0.0])),
-                    ("orig_im_size", Array::new([2], vec![h, w])),
-                ]);
-            }
-            Kind::Efficient => inputs.extend([
-                (
-                    "batched_point_coords",
-                    Array::new([1, n, 1, 2], flat().collect()),
-                ),
-                ("batched_point_labels", Array::new([1, n, 1], vec![1.0; n])),
-                (
-                    "orig_im_size",
-                    Array::new([2], vec![encoded.size[1] as f32, encoded.size[0] as f32]),
-                ),
-            ]),
-            Kind::Transformers { .. } => inputs.extend([
-                ("input_points", Array::new([1, n, 1, 2], flat().collect())),
-                ("input_labels", Array::new([1, n, 1], vec![1.0; n])),
-                ("input_boxes", Array::new([1, 0, 4], Vec::new())),
-            ]),
-        }
+        inputs.extend(self.kind.prompt(encoded, points));
         inputs.retain(|(name, _)| self.decoder.input(&[name]).is_some());
         let find = |names: &[&str], what: &str| {
             self.decoder

@@ -46,10 +46,7 @@ pub(super) fn segment(
         work.advance()?;
         Ok(Level::ALL.map(|level| list.count(level)))
     };
-    let counts = training
-        .par_iter()
-        .map(of_photo)
-        .collect::<Result<Vec<_>>>()?;
+    let counts: Vec<[usize; 3]> = training.par_iter().map(of_photo).collect::<Result<_>>()?;
     if counts.iter().flatten().all(|count| *count == 0) {
         bail!(
             "{}: no mask was found in any training photo; check the segmenter or the imported masks",
@@ -71,9 +68,8 @@ pub(super) fn segment(
         ));
     }
     let mean = |k: usize| counts.iter().map(|c| c[k]).sum::<usize>() as f64 / training.len() as f64;
-    let kept = Level::ALL
-        .into_iter()
-        .filter(|level| config.eyes.keeps(*level));
+    let kept = Level::ALL.into_iter();
+    let kept = kept.filter(|level| config.eyes.keeps(*level));
     let means = kept
         .map(|level| (level.name().to_owned(), mean(level as usize)))
         .collect();

@@ -104,49 +104,26 @@ pub(super) fn settle_convention(
         }
         Some(asked) => asked,
         None if dataset.conventions.len() < 2 => standard,
-        None => {
-            let keypoints: Vec<Keypoints> =
-                photos.iter().map(|photo| photo.points.clone()).collect();
-            let matches = pose_convention::sample(&keypoints);
-            let conventions = dataset.conventions.clone();
-            let by = |convention: PoseConvention| {
-                dataset.apply_convention(convention);
-                let pose = |(known, posed): (&PreparedPhoto, &PosedPhoto)| Camera {
-                    world_to_camera: posed.camera.world_to_camera,
-                    ..known.camera.clone()
-                };
-                (
-                    convention,
-                    photos
-                        .iter()
-                        .zip(&dataset.photos)
-                        .map(pose)
-                        .collect::<Vec<_>>(),
-                )
-            };
-            let candidates: Vec<_> = conventions.into_iter().map(by).collect();
-            match pose_convention::judge(&candidates, &keypoints, &matches) {
-                Verdict::Standard => standard,
-                Verdict::Other(found, [share, usual]) => {
-                    let warning = format!(
-                        "the poses are read as {} ({:.0} % of the key point matches agree), not as {} ({:.0} %); \
-                         set pose_convention to choose another one",
-                        found.name(),
-                        100.0 * share,
-                        standard.name(),
-                        100.0 * usual
-                    );
-                    run.warn(&warning);
-                    warnings.push(warning);
-                    found
-                }
-                Verdict::Unclear(among) => bail!(
-                    "the poses do not fit the photos as {}, but fit equally well as {}; set pose_convention to the one in which they are written",
+        None => match judged_convention(dataset, photos) {
+            Verdict::Standard => standard,
+            Verdict::Other(found, [share, usual]) => {
+                let warning = format!(
+                    "the poses are read as {} ({:.0} % of the key point matches agree), not as {} ({:.0} %); \
+                     set pose_convention to choose another one",
+                    found.name(),
+                    100.0 * share,
                     standard.name(),
-                    names(&among)
-                ),
+                    100.0 * usual
+                );
+                super::warn(run, warnings, warning);
+                found
             }
-        }
+            Verdict::Unclear(among) => bail!(
+                "the poses do not fit the photos as {}, but fit equally well as {}; set pose_convention to the one in which they are written",
+                standard.name(),
+                names(&among)
+            ),
+        },
     };
     dataset.apply_convention(chosen);
     for (known, posed) in photos.iter_mut().zip(&dataset.photos) {
@@ -154,6 +131,23 @@ pub(super) fn settle_convention(
         known.camera.world_to_camera = posed.camera.world_to_camera;
     }
     Ok(())
+}
+
+/// Determines which convention of the poses fits the key point matches.
+fn judged_convention(dataset: &mut Dataset, photos: &[PreparedPhoto]) -> Verdict {
+    let keypoints: Vec<Keypoints> = photos.iter().map(|photo| photo.points.clone()).collect();
+    let matches = pose_convention::sample(&keypoints);
+    let mut candidates = Vec::new();
+    for convention in dataset.conventions.clone() {
+        dataset.apply_convention(convention);
+        let pose = |(known, posed): (&PreparedPhoto, &PosedPhoto)| Camera {
+            world_to_camera: posed.camera.world_to_camera,
+            ..known.camera.clone()
+        };
+        let cameras = photos.iter().zip(&dataset.photos).map(pose);
+        candidates.push((convention, cameras.collect::<Vec<_>>()));
+    }
+    pose_convention::judge(&candidates, &keypoints, &matches)
 }
 
 /// Runs structure from motion. Returns names and contents of the files of the model that places
