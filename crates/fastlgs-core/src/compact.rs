@@ -221,11 +221,8 @@ pub fn read(path: &Path) -> Result<Gaussians> {
     };
     let ids = tensor("object_id", Dtype::U16, 1)?;
     let n = ids.shape()[0];
-    let ids: Vec<u16> = ids
-        .data()
-        .chunks_exact(2)
-        .map(|b| u16::from_le_bytes([b[0], b[1]]))
-        .collect();
+    let words = ids.data().as_chunks::<2>().0.iter();
+    let ids: Vec<u16> = words.map(|b| u16::from_le_bytes(*b)).collect();
     let rest = tensor("sh_rest", Dtype::U8, 3)?.shape()[0];
     let sh_degree = (0..=MAX_SH_DEGREE).find(|d| 3 * rest_len(*d) == rest);
     let sh_degree =
@@ -254,7 +251,8 @@ pub fn read(path: &Path) -> Result<Gaussians> {
                 high: bound(1),
                 bytes: bytes as u8,
             };
-            if n > 0 && !(fixed.low.is_finite() && fixed.high.is_finite()) {
+            let is_finite = fixed.low.is_finite() && fixed.high.is_finite();
+            if n > 0 && !is_finite {
                 return Err(bad(format!("the range of '{name}' is not finite")));
             }
             let planes = &planes.data()[k * bytes * n..];

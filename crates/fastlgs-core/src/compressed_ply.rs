@@ -163,20 +163,24 @@ pub fn parse(path: &Path, lines: &[String], body: &[u8]) -> Result<Gaussians> {
         scene.opacity_logits[i] = logit(row.opacity.clamp(0.001, 0.999));
     }
     if let Some(table) = tables.get("sh") {
-        let per_color = rest_len(sh_degree);
-        for (k, rest) in scene.sh_rest.iter_mut().enumerate() {
-            let (i, coefficient) = (k / per_color, k % per_color);
-            let value = |color: usize| {
-                let byte = table
-                    .bytes(i, &format!("f_rest_{}", color * per_color + coefficient))
-                    .and_then(|bytes| bytes.first());
-                // Centre of one of 256 equal steps between -4 and 4.
-                byte.map_or(0.0, |byte| (f32::from(*byte) + 0.5) / 32.0 - 4.0)
-            };
-            *rest = Vec3::new(value(0), value(1), value(2));
-        }
+        read_harmonics(table, &mut scene);
     }
     Ok(scene)
+}
+
+/// Reads the SH coefficients above degree 0, one byte each.
+fn read_harmonics(table: &Table, scene: &mut Gaussians) {
+    let per_color = rest_len(scene.sh_degree);
+    for (k, rest) in scene.sh_rest.iter_mut().enumerate() {
+        let (i, coefficient) = (k / per_color, k % per_color);
+        let value = |color: usize| {
+            let column = format!("f_rest_{}", color * per_color + coefficient);
+            let byte = table.bytes(i, &column).and_then(|bytes| bytes.first());
+            // Centre of one of 256 equal steps between -4 and 4.
+            byte.map_or(0.0, |byte| (f32::from(*byte) + 0.5) / 32.0 - 4.0)
+        };
+        *rest = Vec3::new(value(0), value(1), value(2));
+    }
 }
 
 /// A Gaussian with dequantised values. Colour and opacity are 0 to 1; the rotation is (w, x, y, z).

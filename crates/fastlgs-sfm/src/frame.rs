@@ -51,9 +51,8 @@ pub fn align(
         camera.centre().distance(given[photo].centre()) < near && turn < MAX_ANGLE
     };
     let agree = |frame: &Similarity| -> Vec<usize> {
-        (0..placed.len())
-            .filter(|&k| same(placed[k].0, &moved_by(frame, &placed[k].1)))
-            .collect()
+        let agrees = |k: &usize| same(placed[*k].0, &moved_by(frame, &placed[*k].1));
+        (0..placed.len()).filter(agrees).collect()
     };
     let between = |some: &[usize]| {
         let pair = |&k: &usize| (placed[k].1.centre(), given[placed[k].0].centre());

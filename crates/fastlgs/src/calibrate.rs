@@ -84,10 +84,8 @@ pub fn calibrate(choice: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
             ..TextQuery::new(texts.embed(&[text])?, Calibration::CLIP)
         })
     };
-    let objects: Vec<&SceneObject> = scenes_by_background[0]
-        .iter()
-        .flat_map(|scene| &scene.objects_and_parts)
-        .collect();
+    let scenes = scenes_by_background[0].iter();
+    let objects: Vec<_> = scenes.flat_map(|scene| &scene.objects_and_parts).collect();
     let absent = absent_where(|name: &str| objects.iter().any(|o| o.name.contains(name)));
     let (mut calibrations, mut separation) = (BTreeMap::new(), BTreeMap::new());
     for (background, known) in Background::ALL.into_iter().zip(&scenes_by_background) {
@@ -100,16 +98,13 @@ pub fn calibrate(choice: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
         }
     }
     // `max_by` returns the last of equal values; in reverse order that is grey.
-    let (background, _) = separation
-        .iter()
-        .rev()
-        .max_by(|a, b| a.1.total_cmp(b.1))
-        .with_context(|| {
-            format!(
-                "{}: the encoder cannot distinguish the generated objects by their names; check that it is an image tower of CLIP",
-                image_tower.display()
-            )
-        })?;
+    let best = separation.iter().rev().max_by(|a, b| a.1.total_cmp(b.1));
+    let (background, _) = best.with_context(|| {
+        format!(
+            "{}: the encoder cannot distinguish the generated objects by their names; check that it is an image tower of CLIP",
+            image_tower.display()
+        )
+    })?;
     let (background, Calibrations { texts, pictures }) = (*background, calibrations[background]);
     let kept = calibration_path(&image_tower);
     let file = CalibrationFile {

@@ -76,14 +76,11 @@ impl StagedOutput {
         })?;
         let before = self.folder.root.join(REPLACED_FOLDER);
         let manifest = [MANIFEST.to_owned()];
-        let moves_out = manifest
-            .iter()
-            .chain(&old)
-            .map(|name| (scene.root.join(name), before.join(name)));
-        let moves_in = staged_files
-            .iter()
-            .chain(&manifest)
-            .map(|name| (self.folder.root.join(name), scene.root.join(name)));
+        let (staged, final_root) = (&self.folder.root, &scene.root);
+        let out = manifest.iter().chain(&old);
+        let moves_out = out.map(|name| (final_root.join(name), before.join(name)));
+        let new = staged_files.iter().chain(&manifest);
+        let moves_in = new.map(|name| (staged.join(name), final_root.join(name)));
         let mut moved = Vec::new();
         let done = moves_out.chain(moves_in).try_for_each(|(from, to)| {
             if rename_if_exists(&from, &to)? {
@@ -98,8 +95,9 @@ impl StagedOutput {
                 .rev()
                 .any(|(from, to)| std::fs::rename(to, from).is_err());
         } else {
-            old.iter()
-                .for_each(|file| remove_empty_folders(&scene.root, file));
+            for file in &old {
+                remove_empty_folders(&scene.root, file);
+            }
         }
         done
     }

@@ -244,9 +244,8 @@ fn named_and_sorted(photos: &Path, album: &Album, mut stated: ParsedPoses) -> Re
         .filter(|(file, _)| stated.held_out.iter().any(|held| held == *file))
         .map(|(_, name)| name.clone())
         .collect();
-    for (photo, name) in stated.photos.iter_mut().zip(names) {
-        photo.camera.name = name;
-    }
+    let photos_and_names = stated.photos.iter_mut().zip(names);
+    photos_and_names.for_each(|(photo, name)| photo.camera.name = name);
     let name_of = |index: &usize| &stated.photos[*index].camera.name;
     let mut order: Vec<usize> = (0..stated.photos.len()).collect();
     order.sort_by(|a, b| name_of(a).cmp(name_of(b)));
@@ -291,11 +290,9 @@ fn named_and_sorted(photos: &Path, album: &Album, mut stated: ParsedPoses) -> Re
         });
     }
     let lost = count - dataset.points.len();
-    if lost > 0 {
-        dataset.warnings.push(format!(
-            "{lost} of {count} points have NaN or infinite positions and are ignored"
-        ));
-    }
+    let warning =
+        format!("{lost} of {count} points have NaN or infinite positions and are ignored");
+    dataset.warnings.extend((lost > 0).then_some(warning));
     Ok(dataset)
 }
 

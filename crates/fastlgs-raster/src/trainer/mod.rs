@@ -380,37 +380,31 @@ impl Trainer {
                 let losses = self.engine.losses()?;
                 // For normally distributed errors, mean square = pi/2 x squared mean absolute
                 // error.
-                let psnr = -10.0
-                    * (losses.color_l1.powi(2) * std::f64::consts::FRAC_PI_2)
-                        .max(1e-12)
-                        .log10();
+                let mean_square = losses.color_l1.powi(2) * std::f64::consts::FRAC_PI_2;
+                let psnr = -10.0 * mean_square.max(1e-12).log10();
                 let seconds = started.elapsed().as_secs_f64()
                     - report_seconds
                     - self.loaded_targets.read_seconds;
                 let reporting = Instant::now();
-                report(
-                    &Progress {
-                        iteration,
-                        losses,
-                        psnr,
-                        gaussians: self.engine.len(),
-                        seconds,
-                    },
-                    self,
-                )?;
+                let progress = Progress {
+                    iteration,
+                    losses,
+                    psnr,
+                    gaussians: self.engine.len(),
+                    seconds,
+                };
+                report(&progress, self)?;
                 report_seconds += reporting.elapsed().as_secs_f64();
             }
-            if let Some(path) = checkpoint.filter(|_| {
-                iteration.is_multiple_of(500) && iteration < self.training.config.iterations
-            }) {
+            let is_last = iteration >= self.training.config.iterations;
+            if let Some(path) = checkpoint.filter(|_| iteration.is_multiple_of(500) && !is_last) {
                 self.save(path)?;
             }
         }
         self.engine.losses()?;
-        let (seconds, steps) = (
-            started.elapsed().as_secs_f64() - report_seconds - self.loaded_targets.read_seconds,
-            self.training.iteration - first,
-        );
+        let idle = report_seconds + self.loaded_targets.read_seconds;
+        let seconds = started.elapsed().as_secs_f64() - idle;
+        let steps = self.training.iteration - first;
         Ok(TrainerReport {
             iterations: self.training.iteration,
             steps_here: steps,

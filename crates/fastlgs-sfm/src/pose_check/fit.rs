@@ -143,6 +143,15 @@ pub(super) fn fit(pairs: &[Pair], cameras: &[Camera], rng: &mut Rng) -> Option<S
         .flatten()
 }
 
+/// Returns a camera, moved by a similarity if it belongs to the moved group.
+fn moved(camera: &Camera, similarity: &Similarity, moves: bool) -> Camera {
+    let mut camera = camera.clone();
+    if moves {
+        similarity.move_camera(&mut camera);
+    }
+    camera
+}
+
 /// Refines `first` on the epipolar geometry of all matches between the groups.
 ///
 /// Gauss-Newton on the seven parameters of a small similarity applied after `first`. The residuals
@@ -155,13 +164,7 @@ pub(super) fn refined(
     keypoints: &[Keypoints],
 ) -> Similarity {
     let residuals = |s: &Similarity| -> Vec<f32> {
-        let placed = |i: usize| {
-            let mut camera = cameras[i].clone();
-            if moves(i) {
-                s.move_camera(&mut camera);
-            }
-            camera
-        };
+        let placed = |i: usize| moved(&cameras[i], s, moves(i));
         let of_link = |l: &&Link| {
             let f = fundamental(&placed(l.a), &placed(l.b));
             let error = |&(i, j): &(usize, usize)| {
