@@ -273,7 +273,7 @@ impl Mapper<'_> {
     }
 }
 
-/// Completes global mapping: embeds the objects of [`map`] by the object maps that [`write_maps`]
+/// Completes global mapping: embeds the objects of [`Mapper::map`] by the object maps that [`Mapper::write_maps`]
 /// wrote, and gives the Gaussians their codes.
 pub fn embed_objects(
     scene: &mut Gaussians,
