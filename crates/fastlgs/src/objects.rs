@@ -273,8 +273,8 @@ impl Mapper<'_> {
     }
 }
 
-/// Completes global mapping: embeds the objects of [`Mapper::map`] by the object maps that [`Mapper::write_maps`]
-/// wrote, and gives the Gaussians their codes.
+/// Completes global mapping: embeds the objects of [`Mapper::map`] by the object maps that
+/// [`Mapper::write_maps`] wrote, and gives the Gaussians their codes.
 pub fn embed_objects(
     scene: &mut Gaussians,
     folder: &SceneFolder,
