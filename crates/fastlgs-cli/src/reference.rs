@@ -148,8 +148,8 @@ const OWN_TYPES: [(&str, &str); 2] = [
     ("budget", "Optional[int]"),
 ];
 
-/// Returns `fastlgs/options.py`: a `TypedDict` of the options of each stage. A key is a field of the
-/// stage's configuration; its type and help are those of the command line.
+/// Returns `fastlgs/options.py`: a `TypedDict` of the options of each stage. A key is a field of
+/// the stage's configuration; its type and help are those of the command line.
 fn python_options() -> String {
     let mut out = String::from(
         "\"\"\"Options of the stages, generated from the command line: keyword arguments of the functions.\"\"\"\n\n\

@@ -2,9 +2,9 @@
 //!
 //! The scene first grows up to the limit. Then each Gaussian is scored by how much the training
 //! views would change without it alone, as in Optimal Brain Damage (LeCun et al. 1990); see
-//! [`Engine::saliency`](crate::Engine::saliency). Gaussians are removed in ascending order of their scores, while the sum stays below
-//! `MAX_REMOVED_SHARE` times the squared error of the views. Fewer are removed if the removal costs
-//! more than `MAX_REMOVAL_COST` dB.
+//! [`Engine::saliency`](crate::Engine::saliency). Gaussians are removed in ascending order of their
+//! scores, while the sum stays below `MAX_REMOVED_SHARE` times the squared error of the views.
+//! Fewer are removed if the removal costs more than `MAX_REMOVAL_COST` dB.
 //!
 //! The limit is a share of the error. So an accurate scene keeps faint Gaussians, and an inaccurate
 //! one loses those that could only fit noise. Together, the removed Gaussians cost more than the

@@ -80,8 +80,8 @@ impl Frame {
     }
 
     /// Returns the expected depth of each pixel of a view with the depth as feature
-    /// ([`View::with_depth_as_feature`]), in units of the scene: sum of w z / sum of w, with blending
-    /// weights w. Pixels with a transmittance of `empty` or more are infinite.
+    /// ([`View::with_depth_as_feature`]), in units of the scene: sum of w z / sum of w, with
+    /// blending weights w. Pixels with a transmittance of `empty` or more are infinite.
     pub fn depth(&self, empty: f32) -> Vec<f32> {
         let pixels = self.channels(3, 4).iter().zip(self.transmittance());
         let of_pixel = |(z, t): (&f32, &f32)| {

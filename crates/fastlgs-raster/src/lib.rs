@@ -6,7 +6,8 @@
 //! `project` -> radix sort of depths -> `gather_counts`, scan -> `emit` -> radix sort of tiles ->
 //! `tile_ranges` -> `tile_load`, radix sort of loads -> `blend` -> (training) `ssim_rows`,
 //! `ssim_columns`, `ssim_backward_rows`, `loss_gradient` -> `blend_backward` -> `fold_slots` ->
-//! `project_backward` -> `adam`. `blend_ids`, `blend_votes` and `blend_saliency` use the same lists.
+//! `project_backward` -> `adam`. `blend_ids`, `blend_votes` and `blend_saliency` use the same
+//! lists.
 //!
 //! [`Engine`] is the common interface of [`GpuEngine`] and of [`CpuEngine`], which runs vectorised
 //! Rust.

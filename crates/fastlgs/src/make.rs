@@ -134,8 +134,8 @@ pub fn make_scene(
     Ok((State::Made, report))
 }
 
-/// Returns what a scene is made from: version, seeds, options and photos. Paths of the scene are left
-/// out, because a scene may be moved.
+/// Returns what a scene is made from: version, seeds, options and photos. Paths of the scene are
+/// left out, because a scene may be moved.
 fn made_from(
     photos: &Path,
     preprocess: &preprocess::PreprocessConfig,

@@ -47,9 +47,9 @@ struct Point {
 struct Model {
     name: &'static str,
     projection: LensProjection,
-    /// Parameters in the order of the files, separated by spaces: focal lengths (f), principal point
-    /// (c), radial (k), tangential (p) and thin prism (s) coefficients, and those of the radial
-    /// denominator (d).
+    /// Parameters in the order of the files, separated by spaces: focal lengths (f), principal
+    /// point (c), radial (k), tangential (p) and thin prism (s) coefficients, and those of the
+    /// radial denominator (d).
     parameters: &'static str,
 }
 

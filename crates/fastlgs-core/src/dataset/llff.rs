@@ -62,8 +62,8 @@ pub fn load(photos: &Path) -> Result<ParsedPoses> {
     })
 }
 
-/// Returns the photo of a row: a 3x5 matrix by rows, and two depths. The columns of the matrix are the
-/// axes down, right and back, the position, and height, width and focal length.
+/// Returns the photo of a row: a 3x5 matrix by rows, and two depths. The columns of the matrix are
+/// the axes down, right and back, the position, and height, width and focal length.
 fn posed(path: &Path, file: PathBuf, row: &[f64]) -> Result<PosedPhoto> {
     if let Some(bad) = row[..15].iter().find(|v| !v.is_finite()) {
         let name = file.file_name().unwrap_or_default().to_string_lossy();

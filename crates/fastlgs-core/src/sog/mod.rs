@@ -186,8 +186,8 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
     archive(path, &meta, &pictures)
 }
 
-/// Codes the SH coefficients above degree 0 by a palette. `picture` stores an image of one pixel for
-/// each Gaussian, and returns its name. The palette itself is returned as an image.
+/// Codes the SH coefficients above degree 0 by a palette. `picture` stores an image of one pixel
+/// for each Gaussian, and returns its name. The palette itself is returned as an image.
 fn coded_rest(
     scene: &Gaussians,
     picture: &mut impl FnMut(&'static str, &dyn Fn(usize) -> [u8; 4]) -> String,

@@ -222,8 +222,8 @@ impl ListBuilder {
 }
 
 /// Projects the Gaussians, sorts them by depth and counts their pairs. Returns the view with the
-/// number of pairs, and the order of the Gaussians. Pairs are counted before any is written, so that
-/// no list can overflow.
+/// number of pairs, and the order of the Gaussians. Pairs are counted before any is written, so
+/// that no list can overflow.
 fn count_pairs<'a>(
     gpu: &Gpu,
     kernels: &Kernels,

@@ -27,7 +27,8 @@ impl Trainer {
     /// Starts to train the feature, which then moves geometry too.
     ///
     /// `features` gets the engine, whose state it may replace, the current Gaussians and the
-    /// training cameras. It sets the initial features. [`Trainer::set_codes`] sets the codes that views are trained towards.
+    /// training cameras. It sets the initial features. [`Trainer::set_codes`] sets the codes that
+    /// views are trained towards.
     ///
     /// # Errors
     /// When the device fails, or `features` returns an error. Then the Gaussians have not changed.

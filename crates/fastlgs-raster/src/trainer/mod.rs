@@ -418,8 +418,8 @@ impl Trainer {
         })
     }
 
-    /// Runs the steps that are due after an iteration: density control, opacity reset, alignment and
-    /// pruning.
+    /// Runs the steps that are due after an iteration: density control, opacity reset, alignment
+    /// and pruning.
     fn run_scheduled(&mut self, iteration: u32) -> Result<()> {
         if self.training.config.refines(iteration) {
             self.refine()?;

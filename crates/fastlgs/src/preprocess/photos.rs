@@ -63,7 +63,8 @@ pub(super) struct PreparedPhoto {
     pub points: Keypoints,
     /// Colour at each key point.
     pub colors: Vec<[u8; 3]>,
-    /// Radial term that `remove_distortion` removed in addition to the stated distortion; 0 if none.
+    /// Radial term that `remove_distortion` removed in addition to the stated distortion; 0 if
+    /// none.
     pub removed_k1: f32,
 }
 
