@@ -632,7 +632,7 @@ fn an_exported_page_answers_on_a_static_server() {
         .expect("a folder");
     run::assert_fails(
         &["export", text(scene), text(&other), "--html"],
-        &["is not an export"],
+        &["holds no exported page"],
     );
     assert!(other.join("letter.txt").is_file());
 

@@ -239,7 +239,7 @@ fn a_removed_object_is_replaced_by_its_background() {
     );
     assert_fails(
         &["remove", text(&f.scene), "submarine", "-o", text(&at("x"))],
-        &["'submarine' is not found", "--object"],
+        &["'submarine' is not found", "by its id"],
     );
     assert!(!at("x").exists());
     assert_fails(
