@@ -205,7 +205,7 @@ impl Camera {
 
 /// Distance from the median camera position beyond which a pose counts as an outlier, in multiples
 /// of the median distance.
-const OUTLIER_DISTANCE: f32 = 10.0;
+const OUTLIER_CAMERA_DISTANCE: f32 = 10.0;
 
 /// Marks the cameras that lie far outside the others; their poses are most often wrong. Uses
 /// medians, so that outliers do not shift the reference.
@@ -217,7 +217,9 @@ pub fn outlier_cameras(cameras: &[Camera]) -> Vec<bool> {
     // If most cameras share one position, the median distance is 0 and gives no scale.
     distances
         .iter()
-        .map(|distance| median_distance > 0.0 && *distance > OUTLIER_DISTANCE * median_distance)
+        .map(|distance| {
+            median_distance > 0.0 && *distance > OUTLIER_CAMERA_DISTANCE * median_distance
+        })
         .collect()
 }
 

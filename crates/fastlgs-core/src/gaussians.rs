@@ -302,7 +302,8 @@ impl Gaussians {
     pub fn without_far_outliers(&self) -> (Self, usize) {
         let middle = stats::median_position(self.means.iter().copied());
         let distances: Vec<f32> = self.means.iter().map(|m| m.distance(middle)).collect();
-        let most = OUTLIER_DISTANCE * stats::median(distances.iter().copied()).unwrap_or(0.0);
+        let most =
+            OUTLIER_GAUSSIAN_DISTANCE * stats::median(distances.iter().copied()).unwrap_or(0.0);
         let kept: Vec<usize> = (0..self.len())
             .filter(|i| most == 0.0 || distances[*i] <= most)
             .collect();
@@ -347,7 +348,7 @@ const CHANNEL_NAMES: [&str; BASE_CHANNELS] = [
 const FINITE_LOGIT: f32 = 7.0;
 /// Distance from the median mean beyond which a Gaussian is an outlier, in multiples of the median
 /// distance.
-const OUTLIER_DISTANCE: f32 = 1000.0;
+const OUTLIER_GAUSSIAN_DISTANCE: f32 = 1000.0;
 
 /// Returns ln(p / (1 - p)), the inverse of [`sigmoid`].
 pub fn logit(p: f32) -> f32 {

@@ -224,7 +224,7 @@ pub fn encode_png(picture: impl Into<DynamicImage>) -> Result<Vec<u8>> {
 
 /// Largest image that is decoded from memory, in pixels. A few compressed bytes can expand to a
 /// huge image.
-const MAX_PIXELS: u64 = 100_000_000;
+const MAX_PHOTO_PIXELS: u64 = 100_000_000;
 
 /// Decodes an image in memory as 8-bit RGB. Errors call it `name`.
 ///
@@ -236,13 +236,14 @@ pub fn decode_rgb(name: &str, data: &[u8]) -> Result<RgbImage> {
         .with_guessed_format()
         .ok()
         .and_then(|reader| reader.into_dimensions().ok());
-    if let Some((width, height)) = sides.filter(|(w, h)| u64::from(*w) * u64::from(*h) > MAX_PIXELS)
+    if let Some((width, height)) =
+        sides.filter(|(w, h)| u64::from(*w) * u64::from(*h) > MAX_PHOTO_PIXELS)
     {
         return Err(Error::format(
             path,
             format!(
                 "{width}x{height} pixels is too large; at most {} million pixels are accepted",
-                MAX_PIXELS / 1_000_000
+                MAX_PHOTO_PIXELS / 1_000_000
             ),
         ));
     }

@@ -25,7 +25,7 @@ pub struct Proposal {
 }
 
 /// Largest number of refinement rounds; nearly all sets converge within four.
-const ROUNDS: usize = 8;
+const CONSENSUS_ROUNDS: usize = 8;
 /// Number of seeds that are refined in parallel. Between batches, seeds whose masks all belong to
 /// proposals are skipped.
 const BATCH: usize = 256;
@@ -72,7 +72,7 @@ pub fn proposals(observations: &Observations, min_views: usize) -> Vec<Proposal>
     found
 }
 
-/// Refines the Gaussians of the seed masks until their masks do not change, in at most [`ROUNDS`]
+/// Refines the Gaussians of the seed masks until their masks do not change, in at most [`CONSENSUS_ROUNDS`]
 /// rounds. Returns `None` if fewer than `min_views` views show the set.
 fn refine(
     observations: &Observations,
@@ -82,7 +82,7 @@ fn refine(
 ) -> Option<Proposal> {
     let mut masks_in = seed.to_vec();
     let mut found = None;
-    for _ in 0..ROUNDS {
+    for _ in 0..CONSENSUS_ROUNDS {
         let set = observations.gaussians_in(masks_in.iter().copied(), scratch);
         let masks = observations.matching_masks(&set, scratch);
         let unchanged = masks

@@ -34,7 +34,7 @@ pub struct Hull {
 /// Distance between sampled pixels, along rows and columns.
 const STRIDE: u32 = 6;
 /// Number of points tested along a ray, evenly spaced in 1/depth.
-const STEPS: u32 = 1024;
+const RAY_STEPS: u32 = 1024;
 /// Largest share of the views in which a point of the hull may lie outside the masks. Masks may be
 /// missing or too narrow.
 const MAX_MISSED_SHARE: f32 = 0.1;
@@ -43,11 +43,11 @@ const MAX_MISSED_SHARE: f32 = 0.1;
 const MIN_DEPTH_RATIO: f32 = 1.05;
 /// Smallest depth at which a view searches: 0.5 times the 1/20 quantile of its depths. The quantile
 /// skips outliers.
-const SEARCH_DEPTH: (usize, f32) = (20, 0.5);
+const NEAREST_DEPTH: (usize, f32) = (20, 0.5);
 /// Largest cell distance between neighbouring points of one hull.
 const MAX_CELL_DISTANCE: i32 = 2;
 /// Smallest number of points of a hull.
-const MIN_POINTS: usize = 16;
+const MIN_HULL_POINTS: usize = 16;
 
 /// Returns for each pixel whether masks lie there and no object explains any of them.
 ///
@@ -134,8 +134,8 @@ fn near(view: &Outline) -> f32 {
         .collect();
     depths.sort_by(f32::total_cmp);
     depths
-        .get(depths.len() / SEARCH_DEPTH.0)
-        .map_or(f32::INFINITY, |depth| SEARCH_DEPTH.1 * depth)
+        .get(depths.len() / NEAREST_DEPTH.0)
+        .map_or(f32::INFINITY, |depth| NEAREST_DEPTH.1 * depth)
 }
 
 /// Returns the middle of the hull on the ray of pixel (x, y), and the distance between rays there.
@@ -156,12 +156,12 @@ fn hull_on_ray(
     let to_world = camera.world_to_camera.inverse();
     let place = |depth: f32| to_world.transform_point3(ray * depth);
     let depth = |step: u32| {
-        let share = step as f32 / (STEPS - 1) as f32;
+        let share = step as f32 / (RAY_STEPS - 1) as f32;
         1.0 / ((1.0 - share) / near + share / far)
     };
     let holds = |step: &u32| is_in_hull(views, view, place(depth(*step)), min_views);
-    let first = (0..STEPS).find(holds)?;
-    let last = (first..STEPS).take_while(holds).last()?;
+    let first = (0..RAY_STEPS).find(holds)?;
+    let last = (first..RAY_STEPS).take_while(holds).last()?;
     let middle = 0.5 * (depth(first) + depth(last));
     (MIN_DEPTH_RATIO * depth(last) < far)
         .then(|| (place(middle), STRIDE as f32 * middle / camera.fx))
@@ -214,7 +214,7 @@ fn group_points(found: &[(Vec3, f32)]) -> Vec<Hull> {
             places.push(cells[&cell]);
             edge.extend(around(cell).filter(|beside| left.remove(beside)));
         }
-        if places.len() >= MIN_POINTS {
+        if places.len() >= MIN_HULL_POINTS {
             hulls.push(Hull {
                 points: places,
                 spacing,

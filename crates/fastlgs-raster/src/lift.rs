@@ -21,7 +21,7 @@ pub struct Vote {
 }
 
 /// Votes with less weight are dropped to save memory.
-const MIN_WEIGHT: f32 = 0.02;
+const MIN_VOTE_WEIGHT: f32 = 0.02;
 
 /// Labels of the pixels of a tile.
 pub(crate) struct TileLabels {
@@ -83,7 +83,7 @@ pub(crate) fn summed(tiles: &[Vec<Vote>]) -> Vec<Vote> {
         kept.weight += if same { next.weight } else { 0.0 };
         same
     });
-    all.retain(|v| v.weight >= MIN_WEIGHT);
+    all.retain(|v| v.weight >= MIN_VOTE_WEIGHT);
     all
 }
 

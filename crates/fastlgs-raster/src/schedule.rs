@@ -100,7 +100,7 @@ impl Default for TrainerConfig {
 /// Share of the iterations after which density control begins.
 const REFINE_FROM: f32 = 0.05;
 /// Target number of rounds of density control in a run, within the limits of `BETWEEN_ROUNDS`.
-const ROUNDS: u32 = 16;
+const DENSITY_ROUNDS: u32 = 16;
 /// Smallest and largest number of steps between two rounds. After fewer steps, mean gradients are
 /// noisy. With more, a long run has too few rounds.
 const BETWEEN_ROUNDS: [u32; 2] = [25, 100];
@@ -184,7 +184,7 @@ impl TrainerConfig {
         let growing = self
             .step_at(self.refine_until)
             .saturating_sub(self.step_at(REFINE_FROM));
-        (growing / ROUNDS).clamp(BETWEEN_ROUNDS[0], BETWEEN_ROUNDS[1])
+        (growing / DENSITY_ROUNDS).clamp(BETWEEN_ROUNDS[0], BETWEEN_ROUNDS[1])
     }
 
     /// Returns whether the scene may still grow.

@@ -24,7 +24,7 @@ use serde_json::{Value, json};
 use std::sync::Arc;
 
 /// Largest picture that is rendered for a request, in pixels.
-const MAX_PIXELS: u32 = 1 << 22;
+const MAX_VIEW_PIXELS: u32 = 1 << 22;
 /// Longest text of a query or name, in characters.
 const MAX_TEXT_CHARACTERS: usize = 300;
 /// Largest number of negative texts of a query.
@@ -40,7 +40,7 @@ pub async fn scene(State(app): App) -> Answer {
         "views": app.views()?,
         "trained_here": app.live.is_some(),
         "up": mean_up(&app.cameras()).to_array(),
-        "limits": { "pixels": MAX_PIXELS, "text": MAX_TEXT_CHARACTERS, "body": MAX_BODY_BYTES },
+        "limits": { "pixels": MAX_VIEW_PIXELS, "text": MAX_TEXT_CHARACTERS, "body": MAX_BODY_BYTES },
     });
     let more = match app.scene_handle() {
         None => {
@@ -204,12 +204,12 @@ fn camera_of(
         camera = camera.resized(w, h);
     }
     camera.check().map_err(Failure::bad_request)?;
-    if camera.width.saturating_mul(camera.height) > MAX_PIXELS {
+    if camera.width.saturating_mul(camera.height) > MAX_VIEW_PIXELS {
         return Err(Failure::bad_request(format!(
             "{}x{} is too large: at most {} million pixels",
             camera.width,
             camera.height,
-            MAX_PIXELS / 1_000_000
+            MAX_VIEW_PIXELS / 1_000_000
         )));
     }
     Ok(camera)

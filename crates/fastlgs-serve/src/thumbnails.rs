@@ -9,7 +9,7 @@ use image::imageops::{FilterType, crop_imm, resize};
 use std::collections::BTreeMap;
 
 /// Largest number of views that are searched, evenly spread.
-const VIEWS: usize = 16;
+const THUMBNAIL_VIEWS: usize = 16;
 /// Longer side of these views, in pixels.
 const VIEW_SIDE: u32 = 400;
 /// Longer side of a thumbnail, in pixels.
@@ -36,7 +36,7 @@ struct Best {
 
 /// Returns the step between searched views.
 fn step(scene: &Scene) -> usize {
-    scene.cameras().len().div_ceil(VIEWS).max(1)
+    scene.cameras().len().div_ceil(THUMBNAIL_VIEWS).max(1)
 }
 
 impl Thumbnails {

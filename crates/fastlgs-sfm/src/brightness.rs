@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector};
 use std::collections::BTreeSet;
 
 /// Smallest number of matches from which the brightness of two photos is compared.
-const MIN_MATCHES: usize = 8;
+const MIN_BRIGHTNESS_MATCHES: usize = 8;
 /// Values up to this one (of 255) do not count: ratios of nearly black values are unreliable.
 const DARK: f32 = 8.0;
 /// Values from this one on (of 255) do not count: they may be clipped at white.
@@ -47,7 +47,7 @@ pub fn compare(colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Brightness {
             let usable = |(a, b): &(f32, f32)| a.min(*b) > DARK && a.max(*b) < CLIPPED;
             let mut stops: Vec<f32> = both.filter(usable).map(|(a, b)| (a / b).log2()).collect();
             let count = stops.len();
-            if count < MIN_MATCHES {
+            if count < MIN_BRIGHTNESS_MATCHES {
                 None
             } else {
                 median(&mut stops).map(|stops| (m.a, m.b, stops, count as f32))

@@ -10,9 +10,9 @@ use glam::{Mat4, Quat};
 use std::collections::BTreeSet;
 
 /// Number of random samples of three cameras each (RANSAC).
-const TRIALS: usize = 2000;
+const FRAME_TRIALS: usize = 2000;
 /// Largest distance of positions that count as equal, as a share of the cameras' `spread`.
-const MAX_DISTANCE: f32 = 0.02;
+const MAX_POSE_DISTANCE: f32 = 0.02;
 /// Largest angle between rotations that count as equal, in radians.
 const MAX_ANGLE: f32 = 0.05;
 /// Number of times that the frame is fitted again to all cameras that agree with it.
@@ -39,7 +39,7 @@ pub fn align(
     if placed.len() < MIN_AGREEING {
         return None;
     }
-    let near = MAX_DISTANCE * spread(given);
+    let near = MAX_POSE_DISTANCE * spread(given);
     let moved_by = |frame: &Similarity, camera: &Camera| {
         let mut camera = camera.clone();
         frame.move_camera(&mut camera);
@@ -60,7 +60,7 @@ pub fn align(
     };
     let mut rng = Rng::new(seed, "frame");
     let mut best = Vec::new();
-    for _ in 0..TRIALS {
+    for _ in 0..FRAME_TRIALS {
         let three: [usize; 3] = std::array::from_fn(|_| rng.below(placed.len()));
         let agreeing = between(&three).map(|s| agree(&s)).unwrap_or_default();
         if agreeing.len() > best.len() {

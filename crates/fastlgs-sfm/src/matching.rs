@@ -13,7 +13,7 @@ use glam::{Mat3, Vec2, Vec3};
 const RATIO: f32 = 0.8;
 /// Largest distance between matching descriptors, whose lengths are 512. It is checked on epipolar
 /// lines, where few candidates make the ratio test weak.
-const MAX_DISTANCE: i32 = 300;
+const MAX_DESCRIPTOR_DISTANCE: i32 = 300;
 /// Number of descriptors of the first photo that are compared together with one of the second,
 /// which then stays in the cache.
 const BLOCK: usize = 4;
@@ -151,7 +151,7 @@ fn mutual(of_a: &[Nearest], of_b: &[Nearest]) -> impl Iterator<Item = (usize, us
 /// a to b.
 ///
 /// Of these candidates, mutual nearest neighbours match if they pass the ratio test and are nearer
-/// than `MAX_DISTANCE`.
+/// than `MAX_DESCRIPTOR_DISTANCE`.
 pub fn guided(a: &Keypoints, b: &Keypoints, f: &Mat3, tolerance: f32) -> Vec<(usize, usize)> {
     let [lines_b, lines_a] = [(a, *f), (b, f.transpose())].map(|(points, f)| {
         let line = |p: &Vec2| f * p.extend(1.0);
@@ -178,7 +178,7 @@ pub fn guided(a: &Keypoints, b: &Keypoints, f: &Mat3, tolerance: f32) -> Vec<(us
         }
     }
     mutual(&of_a, &of_b)
-        .filter(|&(i, _)| of_a[i].distance < MAX_DISTANCE * MAX_DISTANCE)
+        .filter(|&(i, _)| of_a[i].distance < MAX_DESCRIPTOR_DISTANCE * MAX_DESCRIPTOR_DISTANCE)
         .collect()
 }
 

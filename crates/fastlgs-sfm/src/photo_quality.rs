@@ -7,7 +7,7 @@ use image::{GrayImage, RgbImage};
 /// A photo is blurred if its sharpness, relative to the median, is below this value.
 const BLURRED: f32 = 0.2;
 /// Smallest weight of a photo's masks, see [`weights`].
-const MIN_WEIGHT: f32 = 0.1;
+const MIN_SHARPNESS_WEIGHT: f32 = 0.1;
 /// Mean difference of grey values, 0 to 255, below which two thumbnails count as the same photo.
 const SAME: f32 = 1.0;
 /// Side of the thumbnails, in pixels.
@@ -70,10 +70,10 @@ pub fn blurred(photos: &[PhotoStats]) -> Vec<usize> {
 }
 
 /// Returns the weight that the masks of each photo have when objects are found: the relative
-/// sharpness of the photo, from `MIN_WEIGHT` to 1.
+/// sharpness of the photo, from `MIN_SHARPNESS_WEIGHT` to 1.
 pub fn weights(photos: &[PhotoStats]) -> Vec<f32> {
     relative(photos)
-        .map(|sharpness| sharpness.clamp(MIN_WEIGHT, 1.0))
+        .map(|sharpness| sharpness.clamp(MIN_SHARPNESS_WEIGHT, 1.0))
         .collect()
 }
 

@@ -13,12 +13,12 @@ const PAIRS: usize = 40;
 /// Largest number of key points per photo that are matched. Only shares are estimated.
 const KEY_POINTS: usize = 1200;
 /// Smallest number of matches of a pair that is used.
-const MIN_MATCHES: usize = 20;
+const MIN_CONVENTION_MATCHES: usize = 20;
 /// Largest epipolar error of an inlier, as a share of the photo's longer side. It is large because
 /// poses may be rough.
 const TOLERANCE: f32 = 0.01;
 /// Smallest share of inliers with which another convention is accepted.
-const MIN_INLIER_SHARE: f32 = 0.5;
+const MIN_CONVENTION_SHARE: f32 = 0.5;
 /// Factor by which the accepted convention's share of inliers must exceed that of every other.
 const MIN_RATIO: f32 = 1.5;
 
@@ -70,7 +70,7 @@ pub fn sample(keypoints: &[Keypoints]) -> Vec<PairMatches> {
         }
     });
     compared
-        .filter(|pair| pair.pairs.len() >= MIN_MATCHES)
+        .filter(|pair| pair.pairs.len() >= MIN_CONVENTION_MATCHES)
         .collect()
 }
 
@@ -145,7 +145,7 @@ pub fn judge(
         "epipolar inlier share by pose convention"
     );
     match shares[..] {
-        [(best, share), ..] if share >= MIN_INLIER_SHARE.max(MIN_RATIO * standard_share) => {
+        [(best, share), ..] if share >= MIN_CONVENTION_SHARE.max(MIN_RATIO * standard_share) => {
             let alike: Vec<PoseConvention> = shares
                 .iter()
                 .filter(|other| MIN_RATIO * other.1 > share)

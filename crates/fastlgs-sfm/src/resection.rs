@@ -15,10 +15,10 @@ const STARTS: usize = 6;
 /// with larger errors count less.
 const LOSS_SCALES: [f64; 4] = [0.2, 0.05, 0.015, 0.005];
 /// Gauss-Newton steps per scale.
-const STEPS: usize = 12;
+const RESECTION_STEPS: usize = 12;
 /// Smallest number and smallest share of points that must agree on a pose. Repeated texture can
 /// make a quarter of them agree on a wrong pose.
-const MIN_POINTS: usize = 25;
+const MIN_RESECTION_POINTS: usize = 25;
 const MIN_SHARE: f32 = 0.3;
 
 /// Computes the poses of `lost` photos, whose poses are unknown or wrong, from points of the other
@@ -111,7 +111,7 @@ fn place_one(
     let found = starts
         .map(|start| refine_pose(start, &seen))
         .max_by_key(|found| found.1)?;
-    let enough = found.1 >= MIN_POINTS && found.1 as f32 >= MIN_SHARE * seen.len() as f32;
+    let enough = found.1 >= MIN_RESECTION_POINTS && found.1 as f32 >= MIN_SHARE * seen.len() as f32;
     tracing::debug!(
         photo = camera.name,
         points = seen.len(),
@@ -127,7 +127,7 @@ fn place_one(
 fn refine_pose(mut camera: Camera, seen: &[(Vec2, Vec3)]) -> (Camera, usize) {
     let side = f64::from(camera.width.max(camera.height));
     for loss_scale in LOSS_SCALES.map(|share| share * side) {
-        for _ in 0..STEPS {
+        for _ in 0..RESECTION_STEPS {
             let Some(motion) = step(&camera, seen, loss_scale) else {
                 break;
             };

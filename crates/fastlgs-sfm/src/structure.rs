@@ -32,9 +32,9 @@ const FOLLOWING: usize = 12;
 /// In addition, all pairs of this many evenly spread photos are matched, to close loops.
 const LOOP_PHOTOS: usize = 40;
 /// Largest longer side, in pixels, of the images for key point detection.
-const SIDE: u32 = 1000;
+const STRUCTURE_SIDE: u32 = 1000;
 /// Smallest number of matches of a pair that is passed to COLMAP.
-const MIN_MATCHES: usize = 15;
+const MIN_PAIR_MATCHES: usize = 15;
 
 const RECONSTRUCT: &str = include_str!("../assets/reconstruct.py");
 
@@ -251,7 +251,8 @@ fn prepare_input(
             &path.file_name().unwrap_or_default().to_string_lossy(),
         ))?;
         let photo = image_io::load_photo(path, OrientationRule::Upright)?.pixels;
-        let scale = (f64::from(SIDE) / f64::from(photo.width().max(photo.height()))).min(1.0);
+        let scale =
+            (f64::from(STRUCTURE_SIDE) / f64::from(photo.width().max(photo.height()))).min(1.0);
         let size = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
         let small = image_io::resize(&photo, size(photo.width()), size(photo.height()));
         let points = keypoints::detect(&image::imageops::grayscale(&small))?;
@@ -356,7 +357,7 @@ pub fn reconstruct_with_lenses(
     }
 }
 
-/// Matches the key points of photo pairs. Pairs with fewer than `MIN_MATCHES` matches are left out.
+/// Matches the key points of photo pairs. Pairs with fewer than `MIN_PAIR_MATCHES` matches are left out.
 fn matched(
     points: &[&Keypoints],
     progress: &(impl Fn(&str, &str) -> bool + Sync),
@@ -375,7 +376,7 @@ fn matched(
         .collect::<Result<Vec<_>>>()?;
     Ok(all
         .into_iter()
-        .filter(|m| m.pairs.len() >= MIN_MATCHES)
+        .filter(|m| m.pairs.len() >= MIN_PAIR_MATCHES)
         .collect())
 }
 

@@ -13,7 +13,7 @@ use rayon::prelude::*;
 
 /// Longer side of the swept photos, in pixels. One point per pixel of these is dense enough for
 /// initialisation.
-const SIDE: u32 = 240;
+const SWEEP_SIDE: u32 = 240;
 /// Number of depth planes, uniform in 1 / depth.
 const PLANES: usize = 96;
 /// Number of neighbours that each photo is compared with.
@@ -89,7 +89,7 @@ pub fn points<E: Send>(
 ) -> Result<Vec<SfmPoint>, E> {
     let bounds = bounds(cameras, tracks);
     let view = |(camera, bounds): (&Camera, Option<[f32; 2]>)| {
-        let camera = &camera.shrunk_to(SIDE);
+        let camera = &camera.shrunk_to(SWEEP_SIDE);
         let color = image_io::resize(&photo(camera)?, camera.width, camera.height);
         let grey = color
             .pixels()

@@ -8,7 +8,7 @@ const MIN_ANGLE: f32 = 0.02;
 /// Largest number of pixels of a point from whose pairs start values are computed.
 const MAX_START_PIXELS: usize = 6;
 /// Gauss-Newton steps. Near the solution, two are sufficient.
-const STEPS: usize = 4;
+const TRIANGULATION_STEPS: usize = 4;
 
 /// A triangulated point and the pixels that agree with it.
 #[derive(Clone, Debug, PartialEq)]
@@ -104,7 +104,7 @@ pub fn locate(seen: &[(&Camera, Vec2)], tolerance: f32) -> Option<Located> {
 /// Minimises the sum of squared reprojection errors from `start` (Gauss-Newton).
 fn least_squares<'a>(start: Vec3, seen: impl Iterator<Item = (&'a Camera, Vec2)> + Clone) -> Vec3 {
     let mut point = start.as_dvec3();
-    for _ in 0..STEPS {
+    for _ in 0..TRIANGULATION_STEPS {
         let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
         for (camera, pixel) in seen.clone() {
             let pose = camera.world_to_camera.as_dmat4();

@@ -20,7 +20,7 @@ const RATE: u32 = 15;
 /// Number of consecutive frames of which only the sharpest is a candidate.
 const WINDOW: usize = 3;
 /// Largest longer side, in pixels, of the images on which frames are compared.
-const SIDE: u32 = 480;
+const FRAME_SIDE: u32 = 480;
 /// Smallest share of matched key points of neighbouring photos, relative to the largest share of
 /// consecutive candidates.
 const SHARED: f32 = 2.0 / 3.0;
@@ -244,7 +244,7 @@ fn choose<E: From<Error>>(
     progress: impl Fn(f64, usize) -> Result<(), E>,
 ) -> Result<Vec<u32>, E> {
     let filter = format!(
-        "fps={RATE},scale='if(gt(iw,ih),min({SIDE},iw),-2)':'if(gt(iw,ih),-2,min({SIDE},ih))'"
+        "fps={RATE},scale='if(gt(iw,ih),min({FRAME_SIDE},iw),-2)':'if(gt(iw,ih),-2,min({FRAME_SIDE},ih))'"
     );
     let mut ffmpeg = Ffmpeg::start(
         video,

@@ -15,7 +15,7 @@ pub const COUNT: usize = 64;
 
 /// Mean projection of 3,086 masks of three scenes. Subtracting it removes what all crops have in
 /// common. It must be measured again if the axes of `Appearance::new` change.
-const MEAN: [f32; COUNT] = [
+const DESCRIPTOR_MEAN: [f32; COUNT] = [
     -2.2, 24.2, -18.5, -5.7, -3.5, 28.2, 37.6, -2.6, 18.4, 14.4, 6.7, -39.7, -7.8, 3.9, 35.8, 34.5,
     -6.3, -49.0, -14.6, 9.1, -3.4, -19.4, -16.1, -17.6, -11.8, 32.5, -31.7, 0.3, 3.4, -13.7, -27.3,
     -3.5, -9.6, -38.9, 13.2, 11.0, -4.6, -15.1, -26.1, -32.9, 34.4, -10.0, -13.6, -24.8, 22.6,
@@ -45,7 +45,7 @@ impl Appearance {
     /// times their cosine.
     pub fn project(&self, logits: &[f32]) -> [f32; COUNT] {
         let mean = logits.iter().sum::<f32>() / logits.len().max(1) as f32;
-        let mut sum = MEAN.map(|m| -m);
+        let mut sum = DESCRIPTOR_MEAN.map(|m| -m);
         for (logit, axes) in logits.iter().zip(&self.0) {
             sum.iter_mut()
                 .zip(axes)
@@ -97,7 +97,7 @@ mod tests {
         let sum: f32 = axes.iter().flatten().sum();
         assert!(
             (axes[0][0] - -1.09525).abs() < 1e-5 && (sum - 311.36).abs() < 0.05,
-            "{} {sum}: the axes have changed, so MEAN must be measured again",
+            "{} {sum}: the axes have changed, so DESCRIPTOR_MEAN must be measured again",
             axes[0][0]
         );
     }

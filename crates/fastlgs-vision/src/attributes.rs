@@ -89,7 +89,7 @@ const NEUTRAL: f32 = 0.25;
 /// comparisons between masks.
 const MASK_WEIGHT: f32 = 0.1;
 /// Weight of an attribute that a text names, relative to the cosine of the rest of the text.
-const WEIGHT: f32 = 0.25;
+const ATTRIBUTE_WEIGHT: f32 = 0.25;
 /// Cosine that unrelated masks gain because they have the named colour. Adding it to the baseline
 /// makes absent names with a colour score like those without.
 const COLOR_BASELINE_SHIFT: f32 = 0.08;
@@ -169,7 +169,7 @@ pub fn of_text(text: &str) -> ([f32; COUNT], String) {
         }
     }
     let count = named.iter().sum::<f32>().max(1.0);
-    let named = named.map(|n: f32| n / count * WEIGHT / MASK_WEIGHT);
+    let named = named.map(|n: f32| n / count * ATTRIBUTE_WEIGHT / MASK_WEIGHT);
     (
         named,
         if rest.is_empty() {
@@ -209,7 +209,9 @@ mod tests {
                 dot(&attributes[*a], &named).total_cmp(&dot(&attributes[*b], &named))
             });
             assert_eq!(best, Some(k), "{text}");
-            assert!((dot(&attributes[k], &named) - WEIGHT * (1.0 - NEUTRAL)).abs() < 1e-5);
+            assert!(
+                (dot(&attributes[k], &named) - ATTRIBUTE_WEIGHT * (1.0 - NEUTRAL)).abs() < 1e-5
+            );
         }
         assert_eq!(of_text("fox"), ([0.0; COUNT], "fox".to_owned()));
         assert_eq!(of_text("Red").1, "Red");

@@ -12,10 +12,10 @@ use std::sync::Arc;
 
 /// Mean and standard deviation of CLIP's training pictures, RGB in [0, 1]. A
 /// `preprocessor_config.json` of the model overrides them.
-const MEAN: [f32; 3] = [0.481_454_66, 0.457_827_5, 0.408_210_73];
+const CLIP_MEAN: [f32; 3] = [0.481_454_66, 0.457_827_5, 0.408_210_73];
 const DEVIATION: [f32; 3] = [0.268_629_54, 0.261_302_6, 0.275_777_1];
 /// Input size in pixels if neither the model nor a configuration file gives one.
-const SIZE: usize = 224;
+const CLIP_SIDE: usize = 224;
 /// Number of crops or texts in one inference.
 const BATCH: usize = 8;
 /// Prompts of a text; the embeddings of all of them are averaged.
@@ -151,8 +151,14 @@ impl ClipImage {
             .or_else(|| side(&configuration["size"]))
             .map(|s| s as usize);
         let output = embedding_output(&model, &IMAGE_OUTPUTS, &settings(path, "config.json")?)?;
-        let (mean, deviation) = (triple("image_mean", MEAN), triple("image_std", DEVIATION));
-        let (size, background) = (fixed.or(configured).unwrap_or(SIZE), Background::default());
+        let (mean, deviation) = (
+            triple("image_mean", CLIP_MEAN),
+            triple("image_std", DEVIATION),
+        );
+        let (size, background) = (
+            fixed.or(configured).unwrap_or(CLIP_SIDE),
+            Background::default(),
+        );
         Ok(Self {
             model: Arc::new(model),
             input,

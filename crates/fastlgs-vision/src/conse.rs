@@ -25,7 +25,7 @@ pub const LENGTH: usize = 384 + attributes::COUNT + appearance::COUNT;
 /// Number of classes that contribute to an embedding.
 const TOP: usize = 10;
 /// Input size of EfficientNet-Lite2 in pixels.
-const SIZE: usize = 260;
+const CROP_SIDE: usize = 260;
 /// Number of dimensions of a projected dense map.
 pub const DENSE: usize = 32;
 /// Number of masks in one inference.
@@ -86,7 +86,10 @@ impl Conse {
         Ok(self
             .classifier
             .run(
-                vec![("image", Array::new([crops.len(), 3, SIZE, SIZE], data))],
+                vec![(
+                    "image",
+                    Array::new([crops.len(), 3, CROP_SIDE, CROP_SIDE], data),
+                )],
                 &["logits"],
             )?
             .remove(0))
@@ -176,7 +179,7 @@ impl Conse {
             .collect();
         let views = [Surround::Neutral, Surround::Context];
         let cut = |&(label, bounds): &(u16, [u32; 4])| {
-            views.map(|s| crops::crop(photo, masks, label, bounds, SIZE, s))
+            views.map(|s| crops::crop(photo, masks, label, bounds, CROP_SIDE, s))
         };
         let of_batch = |batch: &[(u16, [u32; 4])]| -> Result<Vec<Vec<f32>>> {
             let logits = self.logits(&batch.iter().flat_map(cut).collect::<Vec<_>>())?;

@@ -47,9 +47,9 @@ pub struct CalibrationReport {
 /// Seeds of the generated tables.
 const TABLES: [u64; 3] = [1, 2, 3];
 /// Number of photos of each generated scene.
-const VIEWS: usize = 12;
+const CALIBRATION_VIEWS: usize = 12;
 /// Width and height of these photos in pixels.
-const SIZE: (u32, u32) = (480, 360);
+const CALIBRATION_SIZE: (u32, u32) = (480, 360);
 /// Least share of a photo that a mask must cover to be embedded.
 const LEAST_AREA: f32 = 0.0005;
 
@@ -132,11 +132,15 @@ fn embedded_scenes(choice: &ModelChoice, run: &Run) -> Result<Vec<Vec<GeneratedS
     let pictures = models::pictures_dir();
     let mut worlds = TABLES
         .iter()
-        .map(|seed| Kind::Table.world(&pictures, VIEWS, SIZE, *seed))
+        .map(|seed| Kind::Table.world(&pictures, CALIBRATION_VIEWS, CALIBRATION_SIZE, *seed))
         .collect::<Result<Vec<_>, _>>()?;
     // The room needs pictures that may not be installed; the tables do not.
-    worlds.extend(Kind::Room.world(&pictures, VIEWS, SIZE, 0).ok());
-    let work = run.work("calibrate", (worlds.len() * VIEWS) as u64);
+    worlds.extend(
+        Kind::Room
+            .world(&pictures, CALIBRATION_VIEWS, CALIBRATION_SIZE, 0)
+            .ok(),
+    );
+    let work = run.work("calibrate", (worlds.len() * CALIBRATION_VIEWS) as u64);
     let mut scenes: Vec<Vec<GeneratedScene>> = Background::ALL.map(|_| Vec::new()).into();
     for world in worlds {
         let embedded = embed_world(&world, &encoders, || work.advance())?;

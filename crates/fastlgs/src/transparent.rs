@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 /// Longer side of the images in which transparent objects are searched, in pixels.
-const SEARCH_SIDE: u32 = 480;
+const HULL_SEARCH_SIDE: u32 = 480;
 /// Largest number of views in the search; they are spread evenly over all views.
 const MAX_SEARCH_VIEWS: usize = 200;
 /// Opacity of a transparent Gaussian, as a logit.
@@ -137,7 +137,7 @@ fn add_transparent_objects(
 }
 
 /// Returns the pixels of a view that lie in masks, none of which matches an object. The result is
-/// scaled to at most [`SEARCH_SIDE`] pixels. `object_map` is that of the view. `lists` holds the
+/// scaled to at most [`HULL_SEARCH_SIDE`] pixels. `object_map` is that of the view. `lists` holds the
 /// objects of each id.
 fn unexplained(
     folder: &SceneFolder,
@@ -152,7 +152,7 @@ fn unexplained(
         lists,
         min_support,
     );
-    let small = camera.shrunk_to(SEARCH_SIDE);
+    let small = camera.shrunk_to(HULL_SEARCH_SIDE);
     let at = |k: u32, from: u32, to: u32| ((2 * k + 1) * from / (2 * to)) as usize;
     let columns = |x| at(x, camera.width, small.width);
     let rows =
@@ -177,7 +177,7 @@ fn hulls(mapper: &mut Mapper, scene: &Gaussians, unexplained: Vec<Vec<bool>>) ->
     mapper.load(scene)?;
     let (training, antialias) = (mapper.cameras, mapper.config.antialias);
     let outline = |(camera, inside): (&Camera, Vec<bool>)| -> Result<Outline> {
-        let camera = camera.shrunk_to(SEARCH_SIDE);
+        let camera = camera.shrunk_to(HULL_SEARCH_SIDE);
         let depth = depth(mapper.engine, scene, &camera, antialias)?;
         Ok(Outline {
             camera,

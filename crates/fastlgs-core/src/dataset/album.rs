@@ -11,7 +11,7 @@ const FOLDERS: [&str; 2] = ["images", "input"];
 /// Subfolders of NeRF's synthetic scenes, one for each split.
 const SETS: [&str; 3] = ["train", "test", "val"];
 /// Levels of subfolders that are searched for photos, for example one folder for each camera.
-const SEARCH_DEPTH: usize = 4;
+const MAX_FOLDER_DEPTH: usize = 4;
 
 /// Returns the folder that contains the photos: PHOTOS/images, PHOTOS/input, or PHOTOS itself if it
 /// contains photos.
@@ -42,7 +42,7 @@ impl Album {
     pub fn of(root: &Path) -> Self {
         let mut files = Vec::new();
         match images_folder(root).filter(|folder| folder != root) {
-            Some(folder) => collect(&folder, SEARCH_DEPTH, &mut files),
+            Some(folder) => collect(&folder, MAX_FOLDER_DEPTH, &mut files),
             None => {
                 collect(root, 0, &mut files);
                 SETS.iter()

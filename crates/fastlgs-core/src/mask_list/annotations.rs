@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Largest number of pixels of an image. Pixel indices are 32-bit numbers.
-const MAX_PIXELS: u64 = 1 << 31;
+const MAX_MASK_PIXELS: u64 = 1 << 31;
 
 /// A file of annotations in any supported format.
 #[derive(Deserialize)]
@@ -250,7 +250,7 @@ pub fn load(
 }
 
 fn check_size(path: &Path, width: u32, height: u32) -> Result<()> {
-    if (1..=MAX_PIXELS).contains(&(u64::from(width) * u64::from(height))) {
+    if (1..=MAX_MASK_PIXELS).contains(&(u64::from(width) * u64::from(height))) {
         return Ok(());
     }
     Err(Error::format(

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// Largest number of pixels of an image. Pixel indices are 32-bit numbers.
-const MAX_PIXELS: u64 = 1 << 31;
+const MAX_MASK_PIXELS: u64 = 1 << 31;
 
 /// A mask as a COCO annotation.
 #[derive(Serialize, Deserialize)]
@@ -98,7 +98,7 @@ impl MaskList {
         };
         let [height, width] = annotations.first().map_or([0, 0], |a| a.segmentation.size);
         if !annotations.is_empty()
-            && !(1..=MAX_PIXELS).contains(&(u64::from(width) * u64::from(height)))
+            && !(1..=MAX_MASK_PIXELS).contains(&(u64::from(width) * u64::from(height)))
         {
             return Err(Error::format(
                 path,

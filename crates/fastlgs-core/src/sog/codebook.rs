@@ -3,7 +3,7 @@
 /// Number of entries of a codebook (the values of a byte).
 pub const CODES: usize = 256;
 /// Iterations of Lloyd's algorithm; more hardly change the result.
-const ROUNDS: usize = 12;
+const CODEBOOK_ROUNDS: usize = 12;
 
 /// Computes a codebook for `values` with k-means, in ascending order. All entries are 0 without
 /// values.
@@ -31,7 +31,7 @@ pub fn codebook(values: impl Iterator<Item = f32>) -> [f32; CODES] {
     for (k, v) in sorted.iter().enumerate() {
         sums[k + 1] = sums[k] + f64::from(*v);
     }
-    for _ in 0..ROUNDS {
+    for _ in 0..CODEBOOK_ROUNDS {
         let mut begin = 0;
         for k in 0..CODES {
             let end = if k + 1 == CODES {

@@ -11,7 +11,7 @@ const INPUT_ROWS_PER_ROW: usize = 16;
 /// Number of rows that train the palette; the others are only assigned to it.
 const TRAINING_ROWS: usize = 65_536;
 /// Iterations of Lloyd's algorithm.
-const ROUNDS: usize = 8;
+const PALETTE_ROUNDS: usize = 8;
 /// Number of independent partial sums, for vector instructions.
 const LANES: usize = 8;
 
@@ -37,7 +37,7 @@ pub fn palette(rows: &[f32], width: usize) -> Palette {
         (0..count).map(|k| &rows[(k * n / count) * width..][..width]),
         width,
     );
-    for _ in 0..ROUNDS {
+    for _ in 0..PALETTE_ROUNDS {
         let labels = centres.nearest(&sample);
         let mut sums = vec![0.0f64; count * width];
         let mut counts = vec![0u32; count];

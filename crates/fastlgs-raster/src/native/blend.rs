@@ -16,7 +16,7 @@ pub type Tile = [f32; EDGE * EDGE];
 pub const EMPTY: Tile = [0.0; EDGE * EDGE];
 
 /// x offsets of the pixel centres from the tile's upper left corner.
-const COLUMNS: Tile = {
+const COLUMN_OFFSETS: Tile = {
     let mut out = EMPTY;
     let mut p = 0;
     while p < out.len() {
@@ -133,7 +133,7 @@ impl<'a, V: Vector> TileSplat<'a, V> {
     fn new(job: &Job<'a>, gaussian: usize) -> Self {
         let splat = &job.lists.splats[gaussian];
         let [[x, y, qx, qy], [_, log_opacity, ..], _] = *splat;
-        let (dx, down) = (V::load(&COLUMNS).add(V::splat(job.x - x)), job.y - y);
+        let (dx, down) = (V::load(&COLUMN_OFFSETS).add(V::splat(job.x - x)), job.y - y);
         let reach = job.lists.reach[gaussian];
         let row = |y: f32| y.clamp(0.0, EDGE as f32) as i32 as usize;
         let rows = row((-reach - down - 0.5).ceil())..row((reach - down - 0.5).floor() + 1.0);

@@ -12,7 +12,7 @@ const MIN_OBSERVATIONS: usize = 20;
 /// Scale of Cauchy's loss in pixels: larger errors count less.
 const LOSS_SCALE: f64 = 1.0;
 /// Largest number of Levenberg-Marquardt steps in a round.
-const STEPS: usize = 12;
+const BUNDLE_STEPS: usize = 12;
 
 /// A lens that several photos share.
 #[derive(Clone, Copy, Debug, Default)]
@@ -341,12 +341,12 @@ impl Problem<'_> {
         }
     }
 
-    /// Takes at most `STEPS` Levenberg-Marquardt steps; stops when the relative gain is below 1e-4.
+    /// Takes at most `BUNDLE_STEPS` Levenberg-Marquardt steps; stops when the relative gain is below 1e-4.
     pub fn solve(&self, values: &mut Values) {
         let (mut damping, mut cost) = (1e-4, self.cost(values));
         let mut counts = vec![0; self.cameras.len()];
         self.seen.iter().flatten().for_each(|o| counts[o.view] += 1);
-        for _ in 0..STEPS {
+        for _ in 0..BUNDLE_STEPS {
             let (mut reduced, eliminated) = self.eliminate(values, damping);
             for (l, lens) in values.lenses.iter().enumerate() {
                 for (k, value) in [lens.log_focal, lens.k1].into_iter().enumerate() {

@@ -1,7 +1,7 @@
 //! Fits the similarity that aligns a group of photos with the others: first to triangulated points,
 //! then to the epipolar geometry of all matches.
 
-use super::links::{Link, MIN_MATCHES};
+use super::links::{Link, MIN_LINK_MATCHES};
 use crate::keypoints::{Keypoints, epipolar_residual, fundamental};
 use crate::similarity::Similarity;
 use crate::tracks::TOLERANCE;
@@ -13,7 +13,7 @@ use nalgebra::{SMatrix, SVector};
 use std::collections::HashMap;
 
 /// RANSAC iterations.
-const TRIALS: usize = 2000;
+const FIT_TRIALS: usize = 2000;
 /// Largest reprojection error of an inlier, as a share of the photo's width.
 const MAX_ERROR: f32 = 0.02;
 /// Smallest share of inliers of an accepted fit. A pair from a wrong match supports a wrong fit
@@ -101,7 +101,7 @@ pub(super) fn pairs_between(
 /// Returns the similarity that most pairs support: RANSAC over three pairs, then least squares over
 /// the inliers. Returns `None` if too few pairs support it.
 pub(super) fn fit(pairs: &[Pair], cameras: &[Camera], rng: &mut Rng) -> Option<Similarity> {
-    if pairs.len() < MIN_MATCHES {
+    if pairs.len() < MIN_LINK_MATCHES {
         tracing::debug!(pairs = pairs.len(), "too few point pairs for a similarity");
         return None;
     }
@@ -121,7 +121,7 @@ pub(super) fn fit(pairs: &[Pair], cameras: &[Camera], rng: &mut Rng) -> Option<S
         Similarity::between(&pairs.iter().map(|p| (p.from, p.to)).collect::<Vec<_>>())
     };
     let mut best: Vec<Pair> = Vec::new();
-    for _ in 0..TRIALS {
+    for _ in 0..FIT_TRIALS {
         let three: [Pair; 3] = std::array::from_fn(|_| pairs[rng.below(pairs.len())]);
         if let Some(s) = placing(&three) {
             let found = supporters(&s);
@@ -138,7 +138,7 @@ pub(super) fn fit(pairs: &[Pair], cameras: &[Camera], rng: &mut Rng) -> Option<S
         best = refined;
     }
     tracing::debug!(pairs = pairs.len(), support = best.len(), "similarity");
-    (best.len() >= MIN_MATCHES && best.len() as f32 >= MIN_SUPPORT * pairs.len() as f32)
+    (best.len() >= MIN_LINK_MATCHES && best.len() as f32 >= MIN_SUPPORT * pairs.len() as f32)
         .then(|| placing(&best))
         .flatten()
 }

@@ -15,7 +15,7 @@ pub(super) const OVERLAPPING: usize = 6;
 /// matches are mostly repeated texture.
 pub(super) const SAME_DIRECTION: f32 = 0.75;
 /// Smallest number of matches, or of inliers, that counts as evidence.
-pub(super) const MIN_MATCHES: usize = 25;
+pub(super) const MIN_LINK_MATCHES: usize = 25;
 
 /// All matches of two photos, as (key point in a, key point in b), and those that are epipolar
 /// inliers.
@@ -27,14 +27,14 @@ pub(super) struct Link {
 }
 
 impl Link {
-    /// Returns whether at least [`MIN_MATCHES`] matches, and at least half of them, are inliers.
+    /// Returns whether at least [`MIN_LINK_MATCHES`] matches, and at least half of them, are inliers.
     pub fn agrees(&self) -> bool {
-        self.inliers.len() >= MIN_MATCHES && 2 * self.inliers.len() >= self.all.len()
+        self.inliers.len() >= MIN_LINK_MATCHES && 2 * self.inliers.len() >= self.all.len()
     }
 
-    /// Returns whether fewer than 30 % of at least [`MIN_MATCHES`] matches are inliers.
+    /// Returns whether fewer than 30 % of at least [`MIN_LINK_MATCHES`] matches are inliers.
     pub fn contradicts(&self) -> bool {
-        self.all.len() >= MIN_MATCHES && 10 * self.inliers.len() < 3 * self.all.len()
+        self.all.len() >= MIN_LINK_MATCHES && 10 * self.inliers.len() < 3 * self.all.len()
     }
 }
 

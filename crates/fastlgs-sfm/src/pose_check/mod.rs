@@ -13,7 +13,7 @@ use fastlgs_core::Camera;
 use fastlgs_core::rng::Rng;
 use fit::{fit, pairs_between, points_of, refined};
 use glam::Vec3;
-use links::{Link, MIN_MATCHES, SAME_DIRECTION, WINDOW, groups, inliers, links, matched};
+use links::{Link, MIN_LINK_MATCHES, SAME_DIRECTION, WINDOW, groups, inliers, links, matched};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 /// Result of `repair`.
@@ -32,7 +32,7 @@ const EVERYWHERE_STRIDE: usize = 2;
 const MIN_REFERENCE_PHOTOS: usize = 3;
 /// Smallest share of a group's matches with other groups that must be epipolar inliers. Repeated
 /// texture alone reaches about 0.1.
-const MIN_INLIER_SHARE: f32 = 0.3;
+const MIN_GROUP_INLIER_SHARE: f32 = 0.3;
 
 /// Moves groups of cameras that are misplaced, and returns the moved and the contradictory photos.
 ///
@@ -111,7 +111,7 @@ pub fn repair(cameras: &mut [Camera], keypoints: &[Keypoints], seed: u64) -> Pos
             .filter(|g| **g != base)
             .map(|&g| (g, work.inlier_share(g, &good)));
         match shares.min_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0))) {
-            Some((g, share)) if share < MIN_INLIER_SHARE => bad.insert(g),
+            Some((g, share)) if share < MIN_GROUP_INLIER_SHARE => bad.insert(g),
             _ => break,
         };
     }
@@ -122,7 +122,8 @@ pub fn repair(cameras: &mut [Camera], keypoints: &[Keypoints], seed: u64) -> Pos
             .copied()
             .filter(|g| !bad.contains(g) && sizes[g] >= MIN_REFERENCE_PHOTOS)
             .collect();
-        if work.place(next, &good, true) && work.inlier_share(next, &good) >= MIN_INLIER_SHARE {
+        if work.place(next, &good, true) && work.inlier_share(next, &good) >= MIN_GROUP_INLIER_SHARE
+        {
             bad.remove(&next);
         }
     }
@@ -158,7 +159,7 @@ impl Repair<'_> {
     /// 1 if there are no matches.
     fn inlier_share(&self, next: usize, others: &BTreeSet<usize>) -> f32 {
         let counts = |l: &&Link| {
-            l.all.len() >= MIN_MATCHES && self.joins(l, next, others) && self.same_direction(l)
+            l.all.len() >= MIN_LINK_MATCHES && self.joins(l, next, others) && self.same_direction(l)
         };
         let (right, all) = self
             .links
@@ -194,7 +195,7 @@ impl Repair<'_> {
     /// of its links are then used, not only those between similar directions.
     fn place(&mut self, next: usize, others: &BTreeSet<usize>, lost: bool) -> bool {
         let counts = |l: &&Link| {
-            l.all.len() >= MIN_MATCHES
+            l.all.len() >= MIN_LINK_MATCHES
                 && self.joins(l, next, others)
                 && (lost || self.same_direction(l))
         };
@@ -232,7 +233,7 @@ impl Repair<'_> {
             ?after,
             "epipolar inliers between groups before and after a move"
         );
-        if after.0 <= before.0 || after.1 + MIN_MATCHES < before.1 {
+        if after.0 <= before.0 || after.1 + MIN_LINK_MATCHES < before.1 {
             return false;
         }
         self.cameras.clone_from_slice(&moved);
@@ -263,8 +264,11 @@ impl Repair<'_> {
             .flat_map(|&a| others.iter().map(move |&b| (a.min(b), a.max(b))));
         let new = pairs.filter(|p| !known.contains(p)).collect();
         let found = matched(new, self.cameras, self.keypoints);
-        self.links
-            .extend(found.into_iter().filter(|l| l.all.len() >= MIN_MATCHES));
+        self.links.extend(
+            found
+                .into_iter()
+                .filter(|l| l.all.len() >= MIN_LINK_MATCHES),
+        );
     }
 }
 

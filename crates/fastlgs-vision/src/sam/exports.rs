@@ -8,7 +8,7 @@ use image::{DynamicImage, ImageBuffer, Pixel, RgbImage};
 use std::path::Path;
 
 /// Longer side, in pixels, of the images that the models were trained on.
-const SIDE: usize = 1024;
+const SAM_SIDE: usize = 1024;
 /// Side of the low-resolution masks, in cells.
 const MASK_SIDE: usize = 256;
 /// Largest size of the mask logits of one inference, in bytes.
@@ -17,7 +17,7 @@ const MAX_MASK_BYTES: usize = 64 << 20;
 const MASKS: usize = 4;
 /// Mean and standard deviation of the training images, RGB in [0, 255]. SAM and SAM 2 use the same
 /// values.
-const MEAN: [f32; 3] = [123.675, 116.28, 103.53];
+const SAM_MEAN: [f32; 3] = [123.675, 116.28, 103.53];
 const DEVIATION: [f32; 3] = [58.395, 57.12, 57.375];
 /// Names of the encoder's main output in the known exports.
 const EMBEDDING: [&str; 6] = [
@@ -106,7 +106,7 @@ impl Kind {
                 // Size of the full-resolution masks. They are not used, so the size is kept small.
                 let [w, h] = encoded
                     .prompt_size
-                    .map(|v| (v * MASK_SIDE as f32 / SIDE as f32).ceil());
+                    .map(|v| (v * MASK_SIDE as f32 / SAM_SIDE as f32).ceil());
                 let mask = vec![0.0; MASK_SIDE * MASK_SIDE];
                 vec![
                     ("point_coords", Array::new([n, 2, 2], padded.collect())),
@@ -231,7 +231,7 @@ impl Exports {
             ),
             // `[rows][columns][3]`: such encoders normalise and pad the image themselves.
             [_, _, Some(3)] => {
-                let small = scaled(picture, SIDE);
+                let small = scaled(picture, SAM_SIDE);
                 let values = small.as_raw().iter().map(|v| f32::from(*v)).collect();
                 (
                     Array::new([small.height() as usize, small.width() as usize, 3], values),
@@ -239,7 +239,7 @@ impl Exports {
                 )
             }
             [_, Some(3), rows, _] => {
-                let side = rows.unwrap_or(SIDE);
+                let side = rows.unwrap_or(SAM_SIDE);
                 if self.stretched() {
                     // SAM 2 resizes in floats; SAM resizes in bytes.
                     let exact = DynamicImage::ImageRgb8(picture.clone()).into_rgb32f();
@@ -248,7 +248,7 @@ impl Exports {
                     (
                         planar(
                             &small,
-                            MEAN.map(|v| v / 255.0),
+                            SAM_MEAN.map(|v| v / 255.0),
                             DEVIATION.map(|v| v / 255.0),
                             Some(side),
                         ),
@@ -256,7 +256,10 @@ impl Exports {
                     )
                 } else {
                     let small = scaled(picture, side);
-                    (planar(&small, MEAN, DEVIATION, Some(side)), size_of(&small))
+                    (
+                        planar(&small, SAM_MEAN, DEVIATION, Some(side)),
+                        size_of(&small),
+                    )
                 }
             }
             shape => {

@@ -103,7 +103,7 @@ pub(super) fn match_along_epipolar_lines(
 }
 
 /// A photo is isolated if it has fewer matches than this with every other photo.
-const MIN_MATCHES: usize = 15;
+const MIN_NEIGHBOUR_MATCHES: usize = 15;
 
 /// Returns a warning if photos overlap with no other photo, else `None`. It names the isolated
 /// photo with the largest angle to its nearest photo.
@@ -115,7 +115,7 @@ pub(super) fn gap_warning(cameras: &[Camera], matches: &[PairMatches]) -> Option
             .for_each(|photo| most[photo] = most[photo].max(m.pairs.len()));
     }
     let isolated: Vec<usize> = (0..cameras.len())
-        .filter(|&photo| most[photo] < MIN_MATCHES)
+        .filter(|&photo| most[photo] < MIN_NEIGHBOUR_MATCHES)
         .collect();
     let angle_between = |a: usize, b: usize| {
         cameras[a]

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 pub struct Pixels(Vec<(u32, u32)>);
 
 /// Largest number of pixels in a query.
-const MAX_PIXELS: usize = 64;
+const MAX_QUERY_PIXELS: usize = 64;
 
 #[derive(Deserialize)]
 #[serde(
@@ -44,8 +44,10 @@ impl Pixels {
             if !own.contains(&pixel) {
                 own.push(pixel);
             }
-            if own.len() > MAX_PIXELS {
-                return Err(format!("a query can have at most {MAX_PIXELS} pixels"));
+            if own.len() > MAX_QUERY_PIXELS {
+                return Err(format!(
+                    "a query can have at most {MAX_QUERY_PIXELS} pixels"
+                ));
             }
         }
         if own.is_empty() {

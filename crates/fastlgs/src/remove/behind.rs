@@ -7,7 +7,7 @@ use glam::Vec3;
 /// Least number of views that show a remaining Gaussian outside of the hidden pixels.
 const MIN_VIEWS: u8 = 2;
 /// Least sum of blending weights of a Gaussian in such a view, in pixels.
-const MIN_WEIGHT: f32 = 0.5;
+const MIN_SEEN_WEIGHT: f32 = 0.5;
 
 /// Returns for each Gaussian whether it remains. `views` holds the hidden pixels of each view:
 /// those that the object may have coloured.
@@ -28,7 +28,7 @@ pub fn remaining_gaussians(scene: &mut Scene, views: &[(Camera, Vec<bool>)]) -> 
         let view = scene.view(camera);
         for vote in scene.engine().votes(view, &map)? {
             within[vote.gaussian as usize] |= vote.label == 0;
-            if vote.label == 1 && vote.weight >= MIN_WEIGHT {
+            if vote.label == 1 && vote.weight >= MIN_SEEN_WEIGHT {
                 let count = &mut view_counts[vote.gaussian as usize];
                 *count = count.saturating_add(1);
             }
