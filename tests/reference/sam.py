@@ -5,7 +5,7 @@
 Writes to OUT/authors and OUT/transformers: encoder.onnx, decoder.onnx, photo.png,
 points.npy (n, 2; pixels), low.npy (n, masks, 256, 256; logits) and scores.npy (n, masks).
 OUT/authors also gets the masks of the authors' mask generator: masks.npy (m, rows, columns),
-told.npy (m, 2; predicted IoU and stability) and filters.json.
+mask_scores.npy (m, 2; predicted IoU and stability) and filters.json.
 """
 
 import pathlib

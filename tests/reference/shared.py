@@ -72,5 +72,5 @@ def save_found(folder, picture, generator_with, filters):
     )
     found = generator.generate(picture)
     np.save(folder / "masks.npy", np.stack([mask["segmentation"] for mask in found]).astype(np.uint8))
-    np.save(folder / "told.npy", np.array([[mask["predicted_iou"], mask["stability_score"]] for mask in found], np.float32))
+    np.save(folder / "mask_scores.npy", np.array([[mask["predicted_iou"], mask["stability_score"]] for mask in found], np.float32))
     (folder / "filters.json").write_text(json.dumps(filters))

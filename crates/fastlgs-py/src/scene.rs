@@ -15,6 +15,8 @@ use image::RgbImage;
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray3};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -92,6 +94,20 @@ impl Scene {
             work(opened.as_mut().ok_or_else(closed)?)
         };
         py.detach(with_opened).map_err(to_py_error)
+    }
+}
+
+impl Scene {
+    /// Runs a stage on the scene folder, with the device of the scene and seed 0.
+    fn run_stage<'py, C: Serialize + DeserializeOwned + Send, R: Serialize + Send>(
+        &self,
+        py: Python<'py>,
+        known: &C,
+        options: Option<&Bound<'py, PyDict>>,
+        progress: Option<Py<PyAny>>,
+        stage: fn(&C, &fastlgs::Run) -> fastlgs::Result<R>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        stage::with_options(py, known, options, progress, &self.device, 0, stage)
     }
 }
 
@@ -513,15 +529,7 @@ impl Scene {
             object,
             ..Default::default()
         };
-        stage::with_options(
-            py,
-            &known,
-            options,
-            progress,
-            &self.device,
-            0,
-            fastlgs::remove,
-        )
+        self.run_stage(py, &known, options, progress, fastlgs::remove)
     }
 
     /// Measures colour, and with a folder of labels the masks of queries, on held-out views.
@@ -538,15 +546,7 @@ impl Scene {
             labels,
             ..Default::default()
         };
-        stage::with_options(
-            py,
-            &known,
-            options,
-            progress,
-            &self.device,
-            0,
-            fastlgs::eval,
-        )
+        self.run_stage(py, &known, options, progress, fastlgs::eval)
     }
 
     /// Teaches a name by an example: an object id, pixels of a view, or a picture file. Later

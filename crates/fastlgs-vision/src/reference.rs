@@ -107,7 +107,7 @@ fn compare_masks(folder: &Path) {
     };
     let ours = generation::masks(&exports, &photo, &config).unwrap().0;
     let (pixels, shape) = numbers(&folder.join("masks.npy"));
-    let (their_scores, _) = numbers(&folder.join("told.npy"));
+    let (their_scores, _) = numbers(&folder.join("mask_scores.npy"));
     let (w, h) = (shape[2], shape[1]);
     let theirs: Vec<(BitMask, f32, f32)> = pixels
         .chunks_exact(w * h)

@@ -1,6 +1,6 @@
 //! CPU twin of `shaders/blend.wgsl`: front-to-back blending.
 
-use super::{Splat, alpha};
+use super::{Splat, alpha, values_of};
 use crate::View;
 use crate::channels::Channels;
 use crate::view::TILE;
@@ -50,14 +50,7 @@ pub fn blend(
             for batch in pairs.chunks(BATCH) {
                 for &e in batch {
                     let splat = &splats[pair_gaussians[e as usize] as usize];
-                    let values = [
-                        splat[1][2],
-                        splat[1][3],
-                        splat[2][0],
-                        splat[2][1],
-                        splat[2][2],
-                        splat[2][3],
-                    ];
+                    let values = values_of(splat);
                     for ((x, y), transmittance, sums) in &mut pixels {
                         let w = alpha(
                             splat,

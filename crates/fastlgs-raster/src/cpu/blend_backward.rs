@@ -2,7 +2,7 @@
 //! 5.1).
 
 use super::blend::{inside_image, pixels_of};
-use super::{Splat, alpha};
+use super::{Splat, alpha, values_of};
 use crate::View;
 use crate::channels::Channels;
 use crate::view::TILE;
@@ -23,14 +23,7 @@ impl Pixel {
     /// Adds the contribution of a Gaussian to its slot. The gradients of the first
     /// `geometry_channels` channels move geometry.
     fn add(&mut self, splat: &Splat, geometry_channels: usize, slot: &mut [f32; 12]) {
-        let values = [
-            splat[1][2],
-            splat[1][3],
-            splat[2][0],
-            splat[2][1],
-            splat[2][2],
-            splat[2][3],
-        ];
+        let values = values_of(splat);
         let (dx, dy) = (self.x - splat[0][0], self.y - splat[0][1]);
         let a = alpha(splat, dx, dy);
         let w = a * self.transmittance;

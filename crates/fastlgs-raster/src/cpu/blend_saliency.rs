@@ -1,6 +1,6 @@
 //! CPU twin of `shaders/blend_saliency.wgsl`: how much pixels change without a Gaussian.
 
-use super::{BATCH, Splat, alpha, inside_image, pixels_of};
+use super::{BATCH, Splat, alpha, inside_image, pixels_of, values_of};
 use crate::View;
 
 /// Sums the squared changes of a tile's colours without each of its Gaussians. `frame` is the
@@ -30,7 +30,7 @@ pub fn blend_saliency(
         for batch in sorted_pairs[range].chunks(BATCH) {
             for (&e, sum) in batch.iter().zip(&mut sums) {
                 let splat = &splats[pair_gaussians[e as usize] as usize];
-                let color = [splat[1][2], splat[1][3], splat[2][0]];
+                let color = values_of(splat);
                 for ((x, y), at, transmittance, behind) in &mut pixels {
                     let (dx, dy) = (*x as f32 + 0.5 - splat[0][0], *y as f32 + 0.5 - splat[0][1]);
                     let alpha = alpha(splat, dx, dy);

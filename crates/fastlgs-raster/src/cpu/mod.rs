@@ -90,6 +90,12 @@ pub(crate) fn chunks(job: &ChunkJob) -> impl Iterator<Item = std::ops::Range<usi
     (0..job.chunks as usize).map(move |t| (t * length).min(n)..((t + 1) * length).min(n))
 }
 
+/// Returns colour and feature of a splat.
+fn values_of(splat: &Splat) -> [f32; 6] {
+    let [_, [_, _, r, g], [b, f0, f1, f2]] = *splat;
+    [r, g, b, f0, f1, f2]
+}
+
 /// Returns alpha of a splat at the offset (dx, dy) in pixels from its mean; 0 below `ALPHA_MIN`.
 pub(crate) fn alpha(splat: &Splat, dx: f32, dy: f32) -> f32 {
     let exponent =
