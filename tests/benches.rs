@@ -1,5 +1,8 @@
 //! Tests of the benches on generated scenes. They run, their figures are consistent, and the
-//! documented bounds hold. All but the first take minutes: `./test.sh --all` runs them.
+//! documented bounds hold. Most take minutes: `./test.sh --all` runs them.
+
+#[path = "support/skip.rs"]
+mod skip;
 
 use fastlgs::model_choice::SegmenterKind;
 use fastlgs::{Run, preprocess, synth, train};
@@ -241,4 +244,62 @@ fn names() {
     // Both scenes are the same, so the calibration of one has the same accuracy on the other.
     assert_eq!(figures["gap"], 0.0, "{figures}");
     assert!(number(&figures, "auroc_pooled") > 0.6, "{figures}");
+}
+
+/// Runs `fastlgs-bench clip` on a bad folder; the message must contain all `words`.
+fn assert_clip_refuses(folder: &Path, words: &[&str]) {
+    let output = Command::new(env!("CARGO_BIN_EXE_fastlgs-bench"))
+        .args(["clip", text(folder)])
+        .output()
+        .expect("the binary starts");
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert!(
+        output.status.code() == Some(1) && words.iter().all(|word| message.contains(word)),
+        "{message}"
+    );
+}
+
+#[test]
+fn real_clip_embeddings_are_found_and_absent_names_are_not() {
+    let empty = tempfile::tempdir().expect("a temporary folder");
+    assert_clip_refuses(empty.path(), &["texts.json"]);
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/clip");
+    if !data.is_dir() {
+        skip::skip(format_args!("{} is absent", data.display()));
+        return;
+    }
+    let figures = bench(&["clip", text(&data)]);
+    let at_least = |group: &Value, name: &str, least: f64| {
+        assert!(number(group, name) >= least, "{name}: {figures}");
+    };
+    // The calibration of each room is from the other rooms.
+    for group in [&figures["default"], &figures["left_out"]] {
+        at_least(group, "present", 0.9);
+        at_least(group, "furniture", 0.7);
+        assert!(number(group, "absent") <= 0.085, "{figures}");
+    }
+    at_least(&figures["auroc"], "present", 0.96);
+    at_least(&figures["auroc"], "furniture", 0.92);
+    // The constants are those that the bench measures.
+    let measured = |name: &str| number(&figures["calibrations"][name], "temperature");
+    assert!((measured("texts") - 105.0).abs() < 1.0, "{figures}");
+    assert!((measured("pictures") - 36.0).abs() < 1.0, "{figures}");
+    let pairs = &figures["pairs"][0]["calibration"];
+    assert!(
+        (number(pairs, "temperature") - 85.0).abs() < 1.0,
+        "{figures}"
+    );
+
+    let copy = |from: &str, to: &str| {
+        std::fs::copy(data.join(from), empty.path().join(to)).expect("a copy");
+    };
+    copy("texts.json", "texts.json");
+    assert_clip_refuses(empty.path(), &["texts.npy"]);
+    copy("scene0200_00.npy", "texts.npy");
+    assert_clip_refuses(empty.path(), &["103 texts", "14 rows"]);
+    copy("texts.npy", "texts.npy");
+    assert_clip_refuses(empty.path(), &["no room"]);
+    copy("scene0200_00.npy", "room.npy");
+    copy("scene0062_00.views.npy", "room.views.npy");
+    assert_clip_refuses(empty.path(), &["room.npy", "14 objects"]);
 }

@@ -5,6 +5,7 @@
 mod autoencoder;
 mod baseline;
 mod chart;
+mod clip;
 mod command;
 mod disturb;
 mod labelled;
@@ -55,6 +56,8 @@ enum Bench {
     Paper(paper::Args),
     /// Evaluate text queries with a calibration from other scenes, and from all scenes.
     Names(names::Args),
+    /// Evaluate text queries on real CLIP embeddings of rooms, and measure their calibration.
+    Clip(clip::Args),
 }
 
 fn main() -> ExitCode {
@@ -75,5 +78,6 @@ fn bench(what: &Bench, run: &Run) -> Result<Value> {
         Bench::Stability(args) => stability::run(args, run),
         Bench::Paper(args) => paper::run(args, run),
         Bench::Names(args) => names::run(args, run),
+        Bench::Clip(args) => Ok(serde_json::to_value(clip::run(args)?)?),
     }
 }

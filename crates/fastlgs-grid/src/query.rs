@@ -43,24 +43,29 @@ pub struct Hit {
 /// Evidence of a query for one object.
 #[derive(Clone, Copy, Debug)]
 pub struct Evidence {
-    /// Log-odds that the query means this object, up to a constant: calibrated cosine plus the
+    /// Log-odds that the query means this object, up to a constant: calibrated margin plus the
     /// logarithm of its share of the surface.
     pub rank: f32,
-    /// Calibrated cosine: log-odds without the share of the surface.
-    pub calibrated_cosine: f32,
+    /// Calibrated margin: log-odds without the share of the surface.
+    pub calibrated_margin: f32,
     /// Share of absent names whose best margin is smaller than this object's, 0 to 1.
     pub score: f32,
-    /// Standard error of rank and calibrated cosine over the object's views.
+    /// Standard error of rank and calibrated margin over the object's views.
     pub error: f32,
 }
 
 /// Returns the evidence of a query for each object, in order of id.
 ///
-/// By Bayes, rank = temperature * cosine + ln(max(min(f, 1 - f), 1 / n)). f is the object's share
-/// of the scene's surface, n the number of objects, and temperature comes from the
-/// [`crate::calibration::Calibration`].
+/// By Bayes, rank = temperature * margin + ln(max(min(f, 1 - f), 1 / n)). The margin is cosine minus
+/// canonical cosine, f the object's share of the scene's surface, and n the number of objects. The
+/// temperature comes from the [`crate::calibration::Calibration`].
 ///
-/// With the prior f, small fragments need a larger cosine, because there are many of them. Objects
+/// The margin is the linear discriminant of both cosines: some objects are near to all texts, and
+/// the difference cancels that. Between the objects of a room, the regression of a text's cosine on
+/// the canonical cosine has a slope of 0.90 (`fastlgs-bench clip`). Without canonical phrases, the
+/// margin ranks like the cosine.
+///
+/// With the prior f, small fragments need a larger margin, because there are many of them. Objects
 /// that cover more than half of the scene have the prior `1 - f`, because a name separates an
 /// object from the rest. Objects with less than an equal share get the prior `1 / n`.
 ///
@@ -74,11 +79,10 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     let (shares, equal) = (grid.shares(), 1.0 / grid.objects.len().max(1) as f32);
     let seen = grid.objects.iter().filter(|object| is_seen(object)).count();
     let of_object = |(object, share): (&Object, f32)| {
-        let Some(cosine) = mean_cosine(object, query).filter(|_| !is_negative(object, query))
-        else {
+        let Some(margin) = margin(object, query) else {
             return Evidence {
                 rank: f32::NEG_INFINITY,
-                calibrated_cosine: f32::NEG_INFINITY,
+                calibrated_margin: f32::NEG_INFINITY,
                 score: 0.0,
                 error: 0.0,
             };
@@ -86,19 +90,18 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
         if query.from_example && object.embeddings.iter().all(|e| query.positive.contains(e)) {
             return Evidence {
                 rank: f32::INFINITY,
-                calibrated_cosine: f32::INFINITY,
+                calibrated_margin: f32::INFINITY,
                 score: 1.0,
                 error: 0.0,
             };
         }
-        let calibrated_cosine = calibration.temperature * cosine;
-        let variance = mean_over_views(object, |e| (query.cosine(e) - cosine).powi(2))
+        let calibrated_margin = calibration.temperature * margin;
+        let variance = mean_over_views(object, |e| (query.margin(e) - margin).powi(2))
             / object.embeddings.len() as f32;
-        let anything = mean_over_views(object, |e| query.canonical(e));
         Evidence {
-            rank: calibrated_cosine + share.min(1.0 - share).max(equal).ln(),
-            calibrated_cosine,
-            score: calibration.confidence(cosine - anything, seen),
+            rank: calibrated_margin + share.min(1.0 - share).max(equal).ln(),
+            calibrated_margin,
+            score: calibration.confidence(margin, seen),
             error: calibration.temperature * variance.sqrt(),
         }
     };
@@ -112,6 +115,11 @@ pub fn best(grid: &Grid, query: &TextQuery) -> Option<Best> {
         .iter()
         .filter_map(|object| margin(object, query))
         .collect();
+    best_of(&margins)
+}
+
+/// Returns the largest of the objects' margins; `None` with fewer than two.
+pub fn best_of(margins: &[f32]) -> Option<Best> {
     // Alternate objects form the halves, because neighbouring ids have similar sizes.
     let half = |first: usize| {
         margins
@@ -146,24 +154,18 @@ fn is_seen(object: &Object) -> bool {
     !object.embeddings.is_empty() && object.areas.iter().sum::<f32>() > 0.0
 }
 
-/// Returns the area-weighted mean cosine of an object's embeddings with the query; `None` without
-/// embeddings.
-pub fn mean_cosine(object: &Object, query: &TextQuery) -> Option<f32> {
-    is_seen(object).then(|| mean_over_views(object, |e| query.cosine(e)))
-}
-
 /// Returns whether an object is at least as near to a negative as to the query.
 fn is_negative(object: &Object, query: &TextQuery) -> bool {
     mean_over_views(object, |e| query.negative(e)) >= mean_over_views(object, |e| query.cosine(e))
 }
 
-/// Returns an object's margin: the area-weighted mean of cosine minus canonical cosine over its
-/// embeddings.
+/// Returns an object's margin: the mean of [`TextQuery::margin`] over its embeddings, weighted by
+/// mask area.
 ///
 /// Returns `None` without embeddings, or if the object is at least as near to a negative.
 pub fn margin(object: &Object, query: &TextQuery) -> Option<f32> {
     (is_seen(object) && !is_negative(object, query))
-        .then(|| mean_over_views(object, |e| query.cosine(e) - query.canonical(e)))
+        .then(|| mean_over_views(object, |e| query.margin(e)))
 }
 
 /// Returns all objects, sorted by rank in descending order.
@@ -238,10 +240,10 @@ pub fn best_score(ranked: &[Hit]) -> f32 {
 /// Returns the targets; empty means "not found".
 ///
 /// The first target is the found object with the highest rank. Others are added if they do not
-/// overlap a target. Their rank and calibrated cosine may be lower than the first one's by at most
+/// overlap a target. Their rank and calibrated margin may be lower than the first one's by at most
 /// the combined standard error.
 ///
-/// The calibrated cosine must agree as well. Size alone may make a large object the first target,
+/// The calibrated margin must agree as well. Size alone may make a large object the first target,
 /// but not a further one.
 pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConfig) -> Vec<Hit> {
     let evidence = evidence(grid, query);
@@ -259,7 +261,7 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
         if chosen.len() >= config.top_k || first.rank - own.rank > own.error.hypot(first.error) {
             break;
         }
-        let alike = own.calibrated_cosine >= first.calibrated_cosine - own.error.hypot(first.error);
+        let alike = own.calibrated_margin >= first.calibrated_margin - own.error.hypot(first.error);
         if alike && !taken[usize::from(hit.id) - 1] {
             chosen.push(*hit);
             taken
@@ -459,40 +461,19 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn with_clip_statistics_rank_is_as_good_as_cosine() {
+    fn the_margin_cancels_what_an_object_has_with_all_texts() {
         let rng = &mut Rng::new(5, "clip");
-        let mut scene = || -> Grid {
-            let mut objects: Vec<Object> = Vec::new();
-            for id in 1..=200u16 {
-                let parent = if rng.uniform() < 0.2 {
-                    0
-                } else {
-                    (rng.uniform() * f32::from(id - 1)) as u16
-                };
-                let around = objects
-                    .get(usize::from(parent).wrapping_sub(1))
-                    .map_or(0.4, |o| o.areas[0]);
-                // Only the first object matches the text.
-                let right = if id == 1 { 0.08 } else { 0.0 };
-                let own = 0.20 + right + 0.02 * rng.normal();
-                let cosines = (0..5).map(|_| [own, 0.21 + 0.015 * rng.normal()]).collect();
-                objects.push(object_with_cosines(
-                    id,
-                    parent,
-                    around * rng.range(0.05, 0.6),
-                    cosines,
-                ));
-            }
-            // Exchanges it with a random object.
-            let place = 1 + (rng.uniform() * 199.0) as usize;
-            let (first, other) = (
-                objects[0].embeddings.clone(),
-                objects[place].embeddings.clone(),
-            );
-            (objects[0].embeddings, objects[place].embeddings) = (other, first);
-            objects[place].support = 0.5;
+        // Cosines as `fastlgs-bench clip` measures them: an object that is near to one text is near
+        // to all. Only object `right` matches the text.
+        let mut scene = |right: u16| -> Grid {
+            let object = |id: u16| {
+                let nearness = 0.012 * rng.normal();
+                let own = if id == right { 0.06 } else { 0.0 };
+                let cosine = 0.17 + own + 0.9 * nearness + 0.026 * rng.normal();
+                object_with_cosines(id, 0, 0.01, vec![[cosine, 0.22 + nearness]])
+            };
             Grid {
-                objects,
+                objects: (1..=60).map(object).collect(),
                 ..Grid::default()
             }
         };
@@ -500,24 +481,24 @@ pub(crate) mod tests {
             canonical: vec![vec![0.0, 1.0]],
             ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::CLIP)
         };
-        let (mut ours, mut cosines) = (0, 0);
-        const TEXTS: i32 = 4000;
-        for _ in 0..TEXTS {
-            let grid = scene();
-            let own = |o: &&Object| mean_cosine(o, &query).unwrap();
-            let best = grid
+        const TEXTS: u16 = 3000;
+        let (mut by_margin, mut by_cosine) = (0, 0);
+        for text in 0..TEXTS {
+            let right = 1 + text % 60;
+            let grid = scene(right);
+            let cosine = |object: &&Object| query.cosine(&object.embeddings[0]);
+            let nearest = grid
                 .objects
                 .iter()
-                .max_by(|a, b| own(a).total_cmp(&own(b)))
+                .max_by(|a, b| cosine(a).total_cmp(&cosine(b)))
                 .unwrap();
-            cosines += i32::from(best.support == 0.5);
-            ours +=
-                i32::from(grid.objects[usize::from(rank(&grid, &query)[0].id) - 1].support == 0.5);
+            by_cosine += u16::from(nearest.id == right);
+            by_margin += u16::from(rank(&grid, &query)[0].id == right);
         }
-        println!("right object first: {cosines} by cosine, {ours} by rank, of {TEXTS}");
+        println!("right object first: {by_cosine} by cosine, {by_margin} by rank, of {TEXTS}");
         assert!(
-            ours + TEXTS / 50 >= cosines,
-            "right object first: {cosines} by cosine, {ours} by rank, of {TEXTS}"
+            by_margin > by_cosine + TEXTS / 50,
+            "right object first: {by_cosine} by cosine, {by_margin} by rank, of {TEXTS}"
         );
     }
 

@@ -61,7 +61,12 @@ impl TextQuery {
     /// Returns the relevancy S = min_i exp(t phi.q) / (exp(t phi.c_i) + exp(t phi.q)), 0 to 1. At
     /// 0.5, the text is as near as the canonical phrases.
     pub fn relevancy(&self, embedding: &[f32]) -> f32 {
-        1.0 / (1.0 + (TEMPERATURE * (self.canonical(embedding) - self.cosine(embedding))).exp())
+        1.0 / (1.0 + (-TEMPERATURE * self.margin(embedding)).exp())
+    }
+
+    /// Returns the margin: cosine with the query minus canonical cosine.
+    pub fn margin(&self, embedding: &[f32]) -> f32 {
+        self.cosine(embedding) - self.canonical(embedding)
     }
 
     /// Returns the largest cosine of an embedding with a canonical phrase; at least

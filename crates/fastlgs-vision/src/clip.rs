@@ -3,6 +3,7 @@
 use crate::clip_tokens::Tokens;
 use crate::crops::{self, Background};
 use crate::encoder::{Encoder, TextEncoder, normalise};
+use crate::pull::{MODEL_PAIRS, ModelPair};
 use crate::runtime::{Array, Model};
 use crate::{Error, Result};
 use fastlgs_core::{LabelMap, fs};
@@ -84,6 +85,17 @@ fn is_siglip(configuration: &serde_json::Value) -> bool {
     configuration["model_type"]
         .as_str()
         .is_some_and(|kind| kind.starts_with("siglip"))
+}
+
+/// Returns whether a tower is one of OpenAI's: `config.json` in its folder or its parent folder
+/// names it so, or `models pull` fetched it, which offers only those.
+pub fn is_openai(tower: &Path) -> bool {
+    let configured = settings(tower, "config.json").unwrap_or_default();
+    let name = configured["_name_or_path"].as_str().unwrap_or_default();
+    let pulled = |model: &ModelPair| {
+        model.repository.starts_with("Xenova/clip-") && tower.starts_with(model.folder())
+    };
+    name.starts_with("openai/") || MODEL_PAIRS.iter().any(pulled)
 }
 
 /// Returns the embedding output: the first of `names` that exists, SigLIP's pooled output, or the
@@ -437,6 +449,23 @@ mod tests {
                 .all(|(own, wanted)| (own - wanted / 6.0f32.sqrt()).abs() < 0.01),
             "{red:?}"
         );
+    }
+
+    #[test]
+    fn openai_models_are_known_by_their_configuration_or_place() {
+        let dir = tempfile::tempdir().unwrap();
+        let tower = dir.path().join("onnx/text_model.onnx");
+        assert!(!is_openai(&tower));
+        let configure = |name: &str| {
+            let text = format!(r#"{{"_name_or_path": "{name}"}}"#);
+            std::fs::write(dir.path().join("config.json"), text).unwrap();
+        };
+        configure("laion/CLIP-ViT-B-16-laion2B-s34B-b88K");
+        assert!(!is_openai(&tower));
+        configure("openai/clip-vit-base-patch16");
+        assert!(is_openai(&tower));
+        let pulled = |name: &str| ModelPair::find(name).unwrap().folder().join("a.onnx");
+        assert!(is_openai(&pulled("clip-vit-b16")) && !is_openai(&pulled("sam-vit-b")));
     }
 
     #[test]

@@ -32,6 +32,9 @@ pub struct CalibrationReport {
     pub separation: BTreeMap<Background, f32>,
     /// Calibration of texts.
     pub texts: Calibration,
+    /// Whether generated scenes and real rooms agree about absent names. Otherwise the calibration
+    /// of real rooms is kept, with the measured log-odds per unit of margin.
+    pub agrees: bool,
     /// Calibration of pictures.
     pub pictures: Calibration,
     /// Number of objects in the generated scenes.
@@ -59,8 +62,8 @@ struct GeneratedScene {
     grid: Grid,
 }
 
-/// Measures the calibration of CLIP's towers on generated scenes, and writes it beside the image
-/// tower.
+/// Measures the calibration of CLIP's towers on generated scenes, checks it against that of real
+/// rooms, and writes it beside the image tower.
 ///
 /// # Errors
 /// Towers that cannot be loaded or that distinguish no objects, or a folder that cannot be written.
@@ -75,13 +78,14 @@ pub fn calibrate(choice: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
     let scenes_by_background = embedded_scenes(choice, run)?;
     let texts = choice.text_encoder()?;
     let canonical = texts.embed(&CANONICAL)?;
-    let anything = Calibration::CLIP.anything;
+    let real_rooms = Calibrations::of_tower(&choice.clip_files()?[1]);
+    let anything = real_rooms.texts.anything;
     let query = |text: &str| -> Result<TextQuery> {
         let anything = anything + texts.baseline_shift(text);
         Ok(TextQuery {
             canonical: canonical.clone(),
             min_canonical: anything,
-            ..TextQuery::new(texts.embed(&[text])?, Calibration::CLIP)
+            ..TextQuery::new(texts.embed(&[text])?, real_rooms.texts)
         })
     };
     let scenes = scenes_by_background[0].iter();
@@ -93,7 +97,11 @@ pub fn calibrate(choice: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
         let texts = Calibration::measured(&named, anything);
         let pictures = Calibration::measured(&by_examples(known), anything);
         if let (Some(texts), Some(pictures)) = (texts, pictures) {
-            calibrations.insert(background, Calibrations { texts, pictures });
+            let measured = Calibrations {
+                texts: texts.checked_against(&real_rooms.texts),
+                pictures: pictures.checked_against(&real_rooms.pictures),
+            };
+            calibrations.insert(background, measured);
             separation.insert(background, named.separation());
         }
     }
@@ -106,6 +114,9 @@ pub fn calibrate(choice: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
         )
     })?;
     let (background, Calibrations { texts, pictures }) = (*background, calibrations[background]);
+    if !texts.measured {
+        run.warn("in the generated scenes, absent names do not come as near as in real rooms; only the log-odds per unit of margin and the background of crops are measured");
+    }
     let kept = calibration_path(&image_tower);
     let file = CalibrationFile {
         sha256: calibrations::tower_hashes(&choice.files()?),
@@ -116,6 +127,7 @@ pub fn calibrate(choice: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
     Ok(CalibrationReport {
         background,
         separation,
+        agrees: texts.measured,
         texts,
         pictures,
         things: objects.len(),
@@ -282,18 +294,18 @@ fn absent_where(is_present: impl Fn(&str) -> bool) -> Vec<String> {
 /// Least IoU of an object with a label to count as the labelled object.
 const MIN_LABEL_IOU: f64 = 0.5;
 
-/// Adds a sample: the mean cosines of a query with its target and with other objects.
+/// Adds a sample: the margins of a query at its target and at other objects.
 fn add_sample<'a>(
     samples: &mut Samples,
     query: &TextQuery,
     own: &Object,
     others: impl Iterator<Item = &'a Object>,
 ) {
-    if let Some(cosine) = query::mean_cosine(own, query) {
+    if let Some(margin) = query::margin(own, query) {
         samples.add_name(
-            cosine,
+            margin,
             &others
-                .filter_map(|other| query::mean_cosine(other, query))
+                .filter_map(|other| query::margin(other, query))
                 .collect::<Vec<_>>(),
         );
     }

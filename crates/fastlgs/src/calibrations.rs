@@ -5,6 +5,7 @@ use crate::error::Context;
 use fastlgs_core::fs;
 use fastlgs_core::scene_folder::{Manifest, ModelFile};
 use fastlgs_grid::calibration::Calibration;
+use fastlgs_vision::clip;
 use fastlgs_vision::crops::Background;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -109,11 +110,26 @@ impl Calibrations {
         pictures: Calibration::OFFLINE_PICTURES,
     };
 
-    /// Assumed calibrations of a CLIP without calibration file.
+    /// Calibrations of OpenCLIP's models, and of all others without calibration file.
     pub const CLIP: Self = Self {
         texts: Calibration::CLIP,
         pictures: Calibration::CLIP_PICTURES,
     };
+
+    /// Calibrations of OpenAI's models without calibration file.
+    pub const OPENAI_CLIP: Self = Self {
+        texts: Calibration::OPENAI_CLIP,
+        pictures: Calibration::CLIP_PICTURES,
+    };
+
+    /// Returns the calibrations of a CLIP tower without calibration file.
+    pub(crate) fn of_tower(tower: &Path) -> Self {
+        if clip::is_openai(tower) {
+            Self::OPENAI_CLIP
+        } else {
+            Self::CLIP
+        }
+    }
 
     /// Returns the calibrations of the encoder that made a scene's embeddings.
     pub fn of(manifest: &Manifest) -> Self {
@@ -125,7 +141,10 @@ impl Calibrations {
                 .calibrations
                 .remove(&background)
         });
-        known.unwrap_or(Self::CLIP)
+        known.unwrap_or_else(|| {
+            let tower = manifest.models.get("clip_text");
+            tower.map_or(Self::CLIP, |file| Self::of_tower(&file.path))
+        })
     }
 }
 
