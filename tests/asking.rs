@@ -65,6 +65,100 @@ fn absent_objects_are_not_found() {
     );
     let answer: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(answer["found"], false);
+    // The nearest objects are named, with the views that show them best.
+    let nearest = answer["nearest"].as_array().expect("a list");
+    assert_eq!(nearest.len(), 3, "{answer}");
+    for (near, candidate) in nearest
+        .iter()
+        .zip(answer["candidates"].as_array().expect("a list"))
+    {
+        assert_eq!(
+            (&near["id"], &near["score"]),
+            (&candidate["id"], &candidate["score"])
+        );
+        let view = near["best_view"].as_str().expect("a view");
+        assert!(f.photos.join("images").join(view).is_file(), "{view}");
+    }
+    // The message says how to accept one, and its advice works.
+    let folder = f.dir.path().join("nearest");
+    let output = fastlgs(&["query", text(&f.scene), "pizza", "-o", text(&folder)]);
+    let message = String::from_utf8(output.stdout).expect("UTF-8");
+    let id = nearest[0]["id"].to_string();
+    let advice = format!("--object {id}");
+    assert!(
+        message.contains("nearest objects: #") && message.contains(&advice),
+        "{message}"
+    );
+    let (_, rate) = message.split_once("--false-alarms ").expect("a rate");
+    let rate = rate.split_whitespace().next().expect("a rate");
+    let accepted = json(&["query", text(&f.scene), "pizza", "--false-alarms", rate]);
+    assert_eq!(accepted["found"], true, "{accepted}");
+    // The sheet has a tile for each: photo, render, objects, the answer, and three more.
+    let (width, height) = image::image_dimensions(folder.join("sheet.png")).expect("a sheet");
+    assert!(height > width / 2, "two rows: {width}x{height}");
+}
+
+#[test]
+fn objects_are_listed_and_found_by_id() {
+    let Some(f) = fixture() else { return };
+    let folder = f.dir.path().join("listed");
+    let listed = json(&["objects", text(&f.scene), "-o", text(&folder)]);
+    let objects = listed["objects"].as_array().expect("a list");
+    let share = |object: &Value| object["share"].as_f64().expect("a number");
+    assert!(objects.is_sorted_by(|a, b| share(a) >= share(b)));
+    for object in objects {
+        assert!(object["names"].as_array().expect("names").len() <= 3);
+        assert!(object["best_view"].is_string(), "{object}");
+    }
+    assert!(Path::new(listed["sheet"].as_str().expect("a path")).is_file());
+    // The object that answers a text has a name like it.
+    let coffee = json(&[
+        "query",
+        text(&f.scene),
+        "coffee",
+        "--view",
+        "008",
+        "-o",
+        text(&folder),
+    ]);
+    let id = &coffee["objects"][0]["id"];
+    let of_id = objects.iter().find(|object| object["id"] == *id);
+    let names = of_id.expect("the object")["names"].to_string();
+    assert!(
+        ["coffee", "espresso", "cup", "mug"]
+            .iter()
+            .any(|word| names.contains(word)),
+        "{names}"
+    );
+    // Its id gives the same mask.
+    let by_id = json(&[
+        "query",
+        text(&f.scene),
+        "--object",
+        &id.to_string(),
+        "--view",
+        "008",
+        "-o",
+        text(&folder),
+    ]);
+    let mask =
+        |answer: &Value| image::open(answer["mask"].as_str().expect("a path")).expect("a mask");
+    assert_eq!(coffee["objects"].as_array().map(Vec::len), Some(1));
+    assert_eq!(mask(&coffee), mask(&by_id));
+    let count = objects.len();
+    assert_fails(
+        &[
+            "query",
+            text(&f.scene),
+            "--object",
+            &(count + 1).to_string(),
+        ],
+        &["object ids are 1 to"],
+    );
+    assert_fails(
+        &["query", text(&f.scene), "coffee", "--object", "1"],
+        &["--object", "one way"],
+    );
 }
 
 #[test]

@@ -86,6 +86,16 @@ fn the_interface_answers_as_the_query_command_does() {
         keys(&schema("/api/objects", "get")["items"]["properties"]),
         keys(&objects[0])
     );
+    let names = served.json("/api/objects/names", None);
+    assert_eq!(
+        names.as_array().map(Vec::len),
+        objects.as_array().map(Vec::len)
+    );
+    let name = schema("/api/objects/names", "get")["items"]["items"]["properties"].clone();
+    assert_eq!(keys(&name), keys(&names[0][0]));
+    let by_id = serde_json::json!({ "object": answer["objects"][0]["id"], "view": "008.png" });
+    let by_id = served.json("/api/query", Some(by_id));
+    assert_eq!(by_id["objects"][0]["id"], answer["objects"][0]["id"]);
     for (path, methods) in document["paths"].as_object().expect("paths") {
         let path = path
             .replace("{id}", "1")
@@ -161,7 +171,7 @@ fn the_interface_answers_as_the_query_command_does() {
     let huge = format!(r#"{{"image":"{}"}}"#, "A".repeat(9 << 20));
     for (path, body, status, word) in [
         ("/api/query", "{", 400, "JSON"),
-        ("/api/query", "{}", 400, "one of text, point and image"),
+        ("/api/query", "{}", 400, "one of text, point, image and object"),
         ("/api/query", r#"{"text":" "}"#, 400, "empty"),
         ("/api/query", long.as_str(), 400, "301 characters"),
         ("/api/query", r#"{"txt":"cat"}"#, 422, "txt"),

@@ -57,6 +57,9 @@ Run again, it keeps a finished scene and continues an interrupted run. It rebuil
     /// Find the objects that a text, a picture or a pixel names; write masks, heat maps and
     /// Gaussians.
     Query(commands::query::Args),
+    /// List the objects of a scene: ids, likeliest names, views and sizes.
+    #[command(after_help = "Example: fastlgs objects scenes/fox -o lists")]
+    Objects(fastlgs::listing::ListConfig),
     /// Remove an object from a scene and fill the area behind it.
     #[command(after_help = "Example: fastlgs remove scenes/room \"coffee mug\" -o scenes/tidy")]
     Remove(fastlgs::remove::RemoveConfig),
@@ -182,6 +185,9 @@ fn run(command: Command, common: &ui::Common) -> anyhow::Result<Outcome> {
             report::write_summary(common, &fastlgs::render(&config, run)?, words::render)
         }
         Command::Query(args) => commands::query::run(&args, common, run),
+        Command::Objects(config) => {
+            report::write_summary(common, &fastlgs::list(&config, run)?, words::objects)
+        }
         Command::Remove(config) => {
             report::write_summary(common, &fastlgs::remove(&config, run)?, words::remove)
         }

@@ -49,6 +49,7 @@ const VISIBLE_OPTIONS: [(&str, &[&str]); 5] = [
             "view",
             "point",
             "image",
+            "object",
             "heatmap",
             "export",
             "scenes_below",

@@ -264,11 +264,12 @@ fn single_type(option: &Arg) -> String {
 }
 
 /// Commands and the structs of their reports.
-const REPORTS: [(&str, &str); 9] = [
+const REPORTS: [(&str, &str); 10] = [
     ("make", "MakeReport"),
     ("preprocess", "PreprocessReport"),
     ("train", "TrainReport"),
     ("query", "AnswerReport"),
+    ("objects", "ListReport"),
     ("eval", "EvalReport"),
     ("export", "SceneReport"),
     ("remove", "RemoveReport"),

@@ -30,6 +30,60 @@ pub fn megabytes(bytes: u64) -> String {
     format!("{:.1} MB", bytes as f64 / 1e6)
 }
 
+/// Formats the objects of a scene as a table.
+pub fn objects(r: &fastlgs::ListReport) -> String {
+    let row = |object: &fastlgs::listing::ListedObject| {
+        let names = object.names.iter();
+        let names: Vec<String> = names
+            .map(|name| format!("{} {:.2}", name.name, name.score))
+            .collect();
+        let part = match object.parent {
+            0 => String::new(),
+            parent => format!("#{parent}"),
+        };
+        let size = object.bbox3d.map_or(String::new(), |[low, high]| {
+            let [x, y, z] = [0, 1, 2].map(|k| high[k] - low[k]);
+            format!("{x:.2} x {y:.2} x {z:.2}")
+        });
+        [
+            format!("#{}", object.id),
+            part,
+            object.views.to_string(),
+            size,
+            object.best_view.clone().unwrap_or_default(),
+            names.join(", "),
+        ]
+    };
+    let head = [
+        "object",
+        "part of",
+        "views",
+        "size",
+        "best view",
+        "likeliest names",
+    ];
+    let rows: Vec<[String; 6]> = std::iter::once(head.map(str::to_owned))
+        .chain(r.objects.iter().map(row))
+        .collect();
+    let width = |column: usize| {
+        let widths = rows.iter().map(|row| row[column].chars().count());
+        widths.max().unwrap_or(0)
+    };
+    let widths: [usize; 6] = std::array::from_fn(width);
+    let line = |row: &[String; 6]| {
+        let cells = row.iter().zip(widths);
+        let cells: Vec<String> = cells
+            .map(|(cell, width)| format!("{cell:width$}"))
+            .collect();
+        cells.join("  ").trim_end().to_owned()
+    };
+    let mut lines: Vec<String> = rows.iter().map(line).collect();
+    if let Some(sheet) = &r.sheet {
+        lines.push(format!("sheet: {}", sheet.display()));
+    }
+    lines.join("\n")
+}
+
 fn decibels(psnr: Option<f64>) -> String {
     psnr.map(|psnr| format!("{psnr:.2} dB")).unwrap_or_default()
 }

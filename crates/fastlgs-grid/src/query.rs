@@ -2,7 +2,7 @@
 
 use crate::calibration::Best;
 use crate::grid::{Grid, Object};
-use crate::relevancy::TextQuery;
+use crate::relevancy::{Rule, TextQuery};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
@@ -26,8 +26,11 @@ impl Default for QueryConfig {
 
 impl QueryConfig {
     /// Returns the score from which an object counts as found.
-    pub fn min_score(&self) -> f32 {
-        1.0 - self.false_alarms
+    pub fn min_score(&self, rule: Rule) -> f32 {
+        match rule {
+            Rule::Calibrated => 1.0 - self.false_alarms,
+            Rule::Paper => 0.0,
+        }
     }
 }
 
@@ -72,6 +75,8 @@ pub struct Evidence {
 /// The score depends on the margin alone: the object with the largest margin decides whether the
 /// query is answered.
 ///
+/// With [`Rule::Paper`], rank and score are the relevancy instead.
+///
 /// Objects without embeddings, or at least as near to a negative as to the query, have rank -inf
 /// and score 0. The object that gave the example has rank inf and score 1.
 pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
@@ -95,6 +100,9 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
                 error: 0.0,
             };
         }
+        if query.rule == Rule::Paper {
+            return paper_evidence(object, query);
+        }
         let calibrated_margin = calibration.temperature * margin;
         let variance = mean_over_views(object, |e| (query.margin(e) - margin).powi(2))
             / object.embeddings.len() as f32;
@@ -106,6 +114,19 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
         }
     };
     grid.objects.iter().zip(shares).map(of_object).collect()
+}
+
+/// Returns the evidence for an object by the paper's rule: rank and score are the largest relevancy
+/// of its embeddings. The error is 0, so that only the first object is a target.
+fn paper_evidence(object: &Object, query: &TextQuery) -> Evidence {
+    let relevancies = object.embeddings.iter().map(|e| query.relevancy(e));
+    let relevancy = relevancies.fold(0.0, f32::max);
+    Evidence {
+        rank: relevancy,
+        calibrated_margin: relevancy,
+        score: relevancy,
+        error: 0.0,
+    }
 }
 
 /// Returns the largest margin of the objects; `None` if fewer than two objects have one.
@@ -248,7 +269,8 @@ pub fn best_score(ranked: &[Hit]) -> f32 {
 pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConfig) -> Vec<Hit> {
     let evidence = evidence(grid, query);
     let of = |hit: &Hit| evidence[usize::from(hit.id) - 1];
-    let found = |hit: &&Hit| of(hit).rank > f32::NEG_INFINITY && hit.score >= config.min_score();
+    let found =
+        |hit: &&Hit| of(hit).rank > f32::NEG_INFINITY && hit.score >= config.min_score(query.rule);
     let mut found = ranked.iter().filter(found);
     let Some(best) = found.next() else {
         return Vec::new();
@@ -438,6 +460,37 @@ pub(crate) mod tests {
             areas,
             views,
         }
+    }
+
+    #[test]
+    fn by_the_papers_rule_the_largest_relevancy_wins_and_nothing_is_refused() {
+        // One view of object 2 has the largest cosine. Object 1 is larger and near in all views.
+        let objects = vec![
+            object_with_cosines(1, 0, 0.5, vec![[0.25, 0.2]; 3]),
+            object_with_cosines(2, 0, 0.01, vec![[0.3, 0.2], [0.1, 0.2], [0.1, 0.2]]),
+        ];
+        let grid = Grid {
+            objects,
+            ..Grid::default()
+        };
+        let query = TextQuery {
+            canonical: vec![vec![0.0, 1.0]],
+            rule: Rule::Paper,
+            ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::CLIP)
+        };
+        let strict = QueryConfig {
+            false_alarms: 0.0,
+            ..QueryConfig::default()
+        };
+        let ranked = rank(&grid, &query);
+        assert_eq!(ids(&select(&grid, &ranked, &query, &strict)), [2]);
+        let expected = 1.0 / (1.0 + (-1.0f32).exp());
+        assert!((ranked[0].score - expected).abs() < 1e-6, "{ranked:?}");
+        let calibrated = TextQuery {
+            rule: Rule::Calibrated,
+            ..query
+        };
+        assert_eq!(rank(&grid, &calibrated)[0].id, 1);
     }
 
     #[test]

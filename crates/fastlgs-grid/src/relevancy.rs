@@ -1,12 +1,25 @@
 //! Compares embeddings with a query: LERF's relevancy (paper, eq. 4).
 
 use crate::calibration::Calibration;
+use serde::{Deserialize, Serialize};
 
 /// Canonical phrases: those of LERF, without "things".
 pub const CANONICAL: [&str; 3] = ["object", "stuff", "texture"];
 
 /// Factor on cosines before the softmax. It is in LERF's code, not in its paper.
 const TEMPERATURE: f32 = 10.0;
+
+/// How objects are ranked and accepted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Rule {
+    /// By calibrated margin and share of the surface. Absent names are refused.
+    #[default]
+    Calibrated,
+    /// By the largest relevancy of an object's embeddings, as in the paper: the first object is the
+    /// target, and nothing is refused.
+    Paper,
+}
 
 /// A query: positive, canonical and negative embeddings, with the calibration of their encoder.
 #[derive(Clone, Debug)]
@@ -24,6 +37,8 @@ pub struct TextQuery {
     pub min_canonical: f32,
     /// Calibration of the encoder for this kind of query.
     pub calibration: Calibration,
+    /// How objects are ranked and accepted.
+    pub rule: Rule,
 }
 
 /// Computes an inner product. Sixteen partial sums let the compiler vectorise it.
@@ -47,6 +62,7 @@ impl TextQuery {
             negatives: Vec::new(),
             min_canonical: calibration.anything,
             calibration,
+            rule: Rule::default(),
         }
     }
 

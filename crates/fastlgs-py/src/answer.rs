@@ -67,6 +67,12 @@ impl Answer {
         self.report.objects.iter().map(FoundObject::from).collect()
     }
 
+    /// Nearest objects if nothing was found, at most three: id, score and best_view of each.
+    #[getter]
+    fn nearest<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        to_python(py, &self.report.nearest)
+    }
+
     /// The report of the answer, as `fastlgs query --json` prints it.
     #[getter]
     fn report<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {

@@ -252,11 +252,11 @@ impl Scene {
         })
     }
 
-    /// Finds objects by a text, by pixels of the view, or by a picture.
+    /// Finds objects by a text, by pixels of the view, by a picture, or by the id of an object.
     ///
     /// `point` is one pixel (x, y), or a list of pixels of one object. `image` is uint8 (height,
     /// width, 3).
-    #[pyo3(signature = (text = None, *, view = None, point = None, image = None, negatives = Vec::new(), false_alarms = None, top_k = None))]
+    #[pyo3(signature = (text = None, *, view = None, point = None, image = None, object = None, negatives = Vec::new(), false_alarms = None, top_k = None))]
     fn query(
         &self,
         py: Python<'_>,
@@ -264,17 +264,21 @@ impl Scene {
         view: Option<&Bound<'_, PyAny>>,
         point: Option<PointArgument>,
         image: Option<PyReadonlyArray3<'_, u8>>,
+        object: Option<u16>,
         negatives: Vec<String>,
         false_alarms: Option<f32>,
         top_k: Option<usize>,
     ) -> PyResult<Answer> {
-        let ask = match (text, point, image) {
-            (Some(text), None, None) => ObjectQuery::Text(text),
-            (None, Some(point), None) => ObjectQuery::Point(point.pixels()?),
-            (None, None, Some(image)) => ObjectQuery::Image("image".to_owned(), picture(&image)?),
+        let ask = match (text, point, image, object) {
+            (Some(text), None, None, None) => ObjectQuery::Text(text),
+            (None, Some(point), None, None) => ObjectQuery::Point(point.pixels()?),
+            (None, None, None, Some(id)) => ObjectQuery::Object(id),
+            (None, None, Some(image), None) => {
+                ObjectQuery::Image("image".to_owned(), picture(&image)?)
+            }
             _ => {
                 return Err(Error::new_err(
-                    "query in one way: give a text, a point or an image",
+                    "query in one way: give a text, a point, an image or an object",
                 ));
             }
         };
@@ -319,6 +323,16 @@ impl Scene {
         self.with(py, |opened| {
             Ok(opened.grid.objects.iter().map(Object::from).collect())
         })
+    }
+
+    /// Lists all objects and parts with their likeliest names, the largest first, as `fastlgs objects
+    /// --json` prints them.
+    #[pyo3(signature = (names = 3))]
+    fn list_objects<'py>(&self, py: Python<'py>, names: usize) -> PyResult<Bound<'py, PyAny>> {
+        let listed = self.with(py, |opened| {
+            fastlgs::listing::list_objects(&mut opened.scene, names)
+        })?;
+        to_python(py, &listed)
     }
 
     /// Returns the embeddings of an object's masks, (masks, numbers).

@@ -44,7 +44,15 @@ def test_questions_are_answered(scene):
     assert cat.found and bool(cat) and cat.view == view
     assert cat.mask.shape == cat.relevancy.shape == (height, width) and cat.mask.dtype == bool
     assert cat.report["pixels"] == cat.mask.sum()
-    assert scene.query("cat", view=view, false_alarms=0.0).found is False
+    refused = scene.query("cat", view=view, false_alarms=0.0)
+    assert refused.found is False and cat.nearest == []
+    assert [near["id"] for near in refused.nearest] == [c["id"] for c in refused.report["candidates"][:3]]
+    assert all(near["best_view"] in scene.views for near in refused.nearest)
+    # The nearest object is accepted by its id.
+    assert scene.query(object=refused.nearest[0]["id"], view=view).found
+    listed = scene.list_objects(names=2)
+    assert sorted(o["id"] for o in listed) == [o.id for o in scene.objects]
+    assert all(len(o["names"]) <= 2 for o in listed)
     # A query by a pixel finds the object that is rendered there.
     drawn = scene.render(view, "objects")
     y, x = np.argwhere(drawn > 0)[0]

@@ -81,6 +81,13 @@ pub async fn objects(State(app): App) -> Answer {
     app.ready()?.run(|worker| Ok(Json(worker.objects()?))).await
 }
 
+/// `GET /api/objects/names`: lists the likeliest names of all objects in order of their ids.
+pub async fn object_names(State(app): App) -> Answer {
+    app.ready()?
+        .run(|worker| Ok(Json(worker.object_names()?)))
+        .await
+}
+
 /// `GET /api/objects/{id}/thumbnail.png`: returns a small picture of an object.
 pub async fn thumbnail(State(app): App, id: Result<Path<u16>, PathRejection>) -> Answer<Response> {
     let Path(id) = id?;
@@ -230,7 +237,7 @@ fn checked_text(text: &str) -> Answer<&str> {
     }
 }
 
-/// Body of `POST /api/query`; exactly one of `text`, `point` and `image` is required.
+/// Body of `POST /api/query`; exactly one of `text`, `point`, `image` and `object` is required.
 #[derive(Deserialize, Default)]
 #[serde(deny_unknown_fields, default)]
 pub struct QueryBody {
@@ -238,6 +245,8 @@ pub struct QueryBody {
     point: Option<Pixels>,
     /// A PNG or JPEG in base64.
     image: Option<String>,
+    /// Id of an object.
+    object: Option<u16>,
     negative: Vec<String>,
     view: Option<String>,
     camera: Option<Camera>,
@@ -291,16 +300,17 @@ pub async fn query(State(app): App, request: Result<Json<QueryBody>, JsonRejecti
 
 /// Returns what a request asks for.
 async fn object_query(body: &QueryBody, camera: &Camera) -> Answer<ObjectQuery> {
-    match (&body.text, &body.point, &body.image) {
-        (Some(text), None, None) => Ok(ObjectQuery::Text(checked_text(text)?.to_owned())),
-        (None, Some(pixels), None) => match pixels.outside(camera) {
+    match (&body.text, &body.point, &body.image, body.object) {
+        (None, None, None, Some(id)) => Ok(ObjectQuery::Object(id)),
+        (Some(text), None, None, None) => Ok(ObjectQuery::Text(checked_text(text)?.to_owned())),
+        (None, Some(pixels), None, None) => match pixels.outside(camera) {
             None => Ok(ObjectQuery::Point(pixels.clone())),
             Some((x, y)) => Err(Failure::bad_request(format!(
                 "the point {x},{y} lies outside the view of {}x{}",
                 camera.width, camera.height
             ))),
         },
-        (None, None, Some(data)) => {
+        (None, None, Some(data), None) => {
             let data = base64::engine::general_purpose::STANDARD
                 .decode(data)
                 .map_err(|e| Failure::bad_request(format!("image: {e}")))?;
@@ -312,7 +322,7 @@ async fn object_query(body: &QueryBody, camera: &Camera) -> Answer<ObjectQuery> 
             Ok(ObjectQuery::Image("image".into(), picture))
         }
         _ => Err(Failure::bad_request(
-            "give exactly one of text, point and image",
+            "give exactly one of text, point, image and object",
         )),
     }
 }

@@ -10,7 +10,6 @@ mod scene_worker;
 pub mod share;
 mod shared;
 mod splats;
-mod thumbnails;
 
 use anyhow::{Context, Result};
 use axum::extract::DefaultBodyLimit;
@@ -172,6 +171,7 @@ fn router(guard: Arc<Guard>, shared: Arc<AppState>) -> Router {
         .route("/api/training", get(api::training))
         .route("/api/splats", get(api::splats))
         .route("/api/objects", get(api::objects))
+        .route("/api/objects/names", get(api::object_names))
         .route("/api/objects/{id}/thumbnail.png", get(api::thumbnail))
         .route("/api/objects/{id}/view", get(api::best_view))
         .route("/api/names", get(api::names).post(api::teach_name))

@@ -2,13 +2,14 @@
 
 use crate::failure::Failure;
 use crate::splats;
-use crate::thumbnails::Thumbnails;
 use anyhow::{Result, anyhow};
 use axum::body::Bytes;
 use axum::http::StatusCode;
 use fastlgs::Scene;
+use fastlgs::listing::likeliest_names;
 use fastlgs::query::selection;
-use fastlgs_core::{Gaussians, WorldFrame, turbo};
+use fastlgs::visibility::Visibility;
+use fastlgs_core::{Gaussians, WorldFrame, image_io, turbo};
 use fastlgs_grid::Grid;
 use fastlgs_grid::grid::Object;
 use fastlgs_grid::query::{self, QueryConfig};
@@ -18,6 +19,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
 
+/// Largest number of names of an object.
+const MOST_NAMES: usize = 3;
 /// Largest number of waiting requests; further ones get status 503.
 const MAX_WAITING: usize = 32;
 
@@ -27,8 +30,8 @@ pub struct SceneWorker {
     pub scene: Scene,
     /// Object table of the scene.
     pub grid: Arc<Grid>,
-    /// Cached pictures of objects.
-    thumbnails: Thumbnails,
+    /// Which views show which objects, with nothing hidden; after the first request that needs it.
+    visibility: Option<Visibility>,
     /// Visible objects, whose Gaussians are on the device. `all` has all Gaussians while some are
     /// hidden.
     visible: VisibleObjects,
@@ -61,7 +64,7 @@ impl SceneWorker {
         Ok(Self {
             scene,
             grid,
-            thumbnails: Thumbnails::default(),
+            visibility: None,
             visible: VisibleObjects::default(),
             all: None,
             splats: None,
@@ -144,7 +147,7 @@ impl SceneWorker {
             "objects": self.grid.objects.len(),
             "overlaps": self.grid.overlaps.0,
             "gaussians": self.gaussians(),
-            "min_score": QueryConfig::default().min_score(),
+            "min_score": QueryConfig::default().min_score(self.scene.rule()),
             "support_share": query::SUPPORT_SHARE,
             "segmenter": self.scene.manifest().segmenter,
             "encoder": self.scene.manifest().encoder,
@@ -157,16 +160,10 @@ impl SceneWorker {
     /// Lists all objects and parts in order of their ids.
     pub fn objects(&mut self) -> Result<Value> {
         self.set_visible(&VisibleObjects::default())?;
-        // One pass over all Gaussians. Those of an object include those of its parts.
-        let mut own: Vec<Vec<usize>> = vec![Vec::new(); self.grid.objects.len() + 1];
-        for (i, id) in self.scene.gaussians().object_ids.iter().enumerate() {
-            for above in self.grid.chain(*id) {
-                own[usize::from(above)].push(i);
-            }
-        }
+        let own = selection::gaussians_by_object(self.scene.gaussians(), &self.grid);
         let shares = self.grid.shares();
         let row = |o: &Object| {
-            let own = &own[usize::from(o.id)];
+            let own = &own[usize::from(o.id) - 1];
             json!({
                 "id": o.id,
                 "parent": o.parent,
@@ -181,23 +178,38 @@ impl SceneWorker {
         Ok(Value::Array(self.grid.objects.iter().map(row).collect()))
     }
 
-    /// Returns the picture of an object, or `None` if no searched view shows it.
+    /// Lists the likeliest names of each object, in order of id.
+    pub fn object_names(&self) -> Result<Value> {
+        Ok(json!(likeliest_names(&self.scene, &self.grid, MOST_NAMES)?))
+    }
+
+    /// Returns which views show which objects, and the scene with nothing hidden.
+    fn visibility(&mut self) -> Result<(&mut Visibility, &mut Scene)> {
+        self.set_visible(&VisibleObjects::default())?;
+        let visibility = match self.visibility.take() {
+            Some(known) => known,
+            None => Visibility::of(&mut self.scene, &self.grid)?,
+        };
+        Ok((self.visibility.insert(visibility), &mut self.scene))
+    }
+
+    /// Returns the picture of an object, or `None` if no view shows it.
     pub fn picture(&mut self, id: u16) -> Result<Option<RgbImage>> {
-        self.set_visible(&VisibleObjects::default())?;
-        self.thumbnails.picture(&mut self.scene, &self.grid, id)
+        let (visibility, scene) = self.visibility()?;
+        Ok(visibility.thumbnail(scene, id)?)
     }
 
-    /// Returns the picture of an object as PNG, or `None` if no searched view shows it.
+    /// Returns the picture of an object as PNG, or `None` if no view shows it.
     pub fn thumbnail(&mut self, id: u16) -> Result<Option<Vec<u8>>> {
-        self.set_visible(&VisibleObjects::default())?;
-        self.thumbnails.png(&mut self.scene, &self.grid, id)
+        let picture = self.picture(id)?;
+        Ok(picture.map(image_io::encode_png).transpose()?)
     }
 
-    /// Returns the name of the view that shows most of an object, or `None` if no searched view
-    /// does.
+    /// Returns the name of the view that shows most of an object, or `None` if no view does.
     pub fn best_view(&mut self, id: u16) -> Result<Option<String>> {
-        self.set_visible(&VisibleObjects::default())?;
-        self.thumbnails.view(&mut self.scene, &self.grid, id)
+        let (visibility, scene) = self.visibility()?;
+        let best = visibility.best_view(&[id]);
+        Ok(best.map(|view| scene.cameras()[view].name.clone()))
     }
 
     /// Returns the number of Gaussians, including hidden ones.

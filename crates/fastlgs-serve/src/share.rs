@@ -229,6 +229,7 @@ fn write_files(
         &splats::pack(worker.scene.gaussians()),
     )?;
     write_json(&data.join("objects.json"), &worker.objects()?)?;
+    write_json(&data.join("objects/names.json"), &worker.object_names()?)?;
     for id in 1..=worker.grid.objects.len() as u16 {
         if let Some(picture) = worker.picture(id)? {
             let mut jpeg = Vec::new();

@@ -11,6 +11,7 @@ import { getBlob, getJson, postJson } from "./server.js";
 
 const $ = (id) => document.getElementById(id);
 const LISTED = 24; // objects listed before "more"
+const NEAREST = 3; // objects named if nothing is found
 const ASKED_SIDE = 640; // longer side of the view that is queried, in pixels
 
 let scene, stage, objects, recent;
@@ -42,7 +43,7 @@ function update() {
   const { selected, hidden, only, scores, text } = state;
   stage.setObjects({ selected, hidden, only, scores, text, list: objects.colored, members: objects.chain });
   const options = { selected, hidden, minScore: scene.min_score, choose: (id) => select([id]) };
-  const rows = state.ranked ?? objects.parts(0).map((id) => ({ id }));
+  const rows = state.ranked ?? objects.bySize().map((id) => ({ id }));
   $("list-title").textContent = state.ranked ? `Most relevant to "${state.text}"` : "Objects";
   objects.fill($("list"), rows.slice(0, state.listed), options);
   $("more").hidden = rows.length <= state.listed;
@@ -136,7 +137,11 @@ function show(text, { answer, best }) {
     const gone = best ? `, seen best in ${best}` : "";
     say(`"${text}": ${parts}, score ${answer.score.toFixed(2)}${pixels}${gone} (${ms} ms)`);
   } else {
-    say(`"${text}" is not found in this scene: the best object scores ${answer.score.toFixed(2)}, at least ${scene.min_score.toFixed(2)} is needed (${ms} ms)`, true);
+    const near = answer.candidates.slice(0, NEAREST).map(({ id }) => objects.title(id)).join(", ");
+    const accept = scene.shared ? "" : `; if one of them is meant, select it and name it "${text}"`;
+    say(`"${text}" is not found in this scene: the best object scores ${answer.score.toFixed(2)}, at least ${scene.min_score.toFixed(2)} is needed. Nearest: ${near}${accept} (${ms} ms)`, true);
+    // The name is offered for the object that is selected next.
+    $("its-name").value = text;
   }
   select(answer.objects.map((o) => o.id));
 }
@@ -353,6 +358,14 @@ async function ready() {
     + `masks: ${scene.segmenter}, embeddings: ${scene.encoder}; rendered by ${stage.renderer.name}, `
     + (scene.shared ? `${scene.shared.words.toLocaleString("en")} words can be queried` : `queries on ${scene.adapter}`);
   $("text").disabled = false;
+  update();
+  nameObjects();
+}
+
+// Loads the likeliest names of the objects. The page works without them: a scene may have no text
+// encoder.
+async function nameObjects() {
+  objects.setNames(await getJson("/api/objects/names").catch(() => []));
   update();
 }
 

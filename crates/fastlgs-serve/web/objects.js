@@ -14,6 +14,7 @@ export class Objects {
     const bySize = (a, b) => this.byId.get(b).gaussians - this.byId.get(a).gaussians;
     for (const ids of this.children.values()) ids.sort(bySize);
     this.pictures = new Map();
+    this.names = new Map(); // likeliest names of each object, once they are loaded
     this.chain = this.chain.bind(this);
     // All Gaussian ids, each with the colour of its smallest object.
     this.colored = list.concat(overlaps.map(([smallest], k) => ({ id: list.length + 1 + k, color: this.byId.get(smallest).color })));
@@ -33,6 +34,22 @@ export class Objects {
     const box = this.byId.get(id).bbox3d;
     const place = box && camera.project(box[0].map((low, k) => (low + box[1][k]) / 2), camera.lens(width, height));
     return Boolean(place) && place.every((v, k) => v > 0 && v < [width, height][k]);
+  }
+
+  // Takes the likeliest names of all objects, in order of their ids.
+  setNames(names) {
+    this.names = new Map(this.list.map((o, k) => [o.id, names[k]]));
+  }
+
+  // Returns the id of an object with its likeliest name.
+  title(id) {
+    const [likeliest] = this.names.get(id) ?? [];
+    return likeliest ? `#${id} ${likeliest.name}?` : `#${id}`;
+  }
+
+  // Returns the ids of all objects and parts, the largest first.
+  bySize() {
+    return this.list.toSorted((a, b) => b.share - a.share).map((o) => o.id);
   }
 
   parts(id) {
@@ -80,7 +97,7 @@ export class Objects {
       image.alt = "";
       image.loading = "lazy";
       const name = document.createElement("span");
-      name.textContent = score === undefined ? `#${id}` : `#${id}  ${score.toFixed(2)}`;
+      name.textContent = score === undefined ? this.title(id) : `${this.title(id)}  ${score.toFixed(2)}`;
       button.append(image, name);
       if (score !== undefined) {
         const meter = document.createElement("meter");

@@ -39,9 +39,9 @@ pub fn crop(
         photo.height() as f32 / masks.height as f32,
     );
     let margin = if surround == Surround::Context {
-        1.25
+        CONTEXT_MARGIN
     } else {
-        1.05
+        MARGIN
     };
     let side = (((x1 - x0) * sx).max((y1 - y0) * sy) * margin).max(4.0);
     let (left, top) = (
@@ -87,6 +87,8 @@ pub fn crop(
 
 /// Side of a crop, relative to the longer side of the mask's box.
 const MARGIN: f32 = 1.05;
+/// The same for crops with context.
+const CONTEXT_MARGIN: f32 = 1.25;
 
 /// Background of the mask in a crop for CLIP. The best choice depends on the model.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -99,11 +101,13 @@ pub enum Background {
     Black,
     /// The photo, blurred.
     Blurred,
+    /// The photo itself, with a wider margin around the box.
+    Context,
 }
 
 impl Background {
     /// All backgrounds.
-    pub const ALL: [Self; 3] = [Self::Grey, Self::Black, Self::Blurred];
+    pub const ALL: [Self; 4] = [Self::Grey, Self::Black, Self::Blurred, Self::Context];
 }
 
 /// Side in pixels to which a blurred background is reduced: it still shows the kind of place, but
@@ -125,7 +129,12 @@ pub fn bicubic(
         photo.width() as f32 / masks.width as f32,
         photo.height() as f32 / masks.height as f32,
     );
-    let side = (((x1 - x0) * sx).max((y1 - y0) * sy) * MARGIN)
+    let margin = if background == Background::Context {
+        CONTEXT_MARGIN
+    } else {
+        MARGIN
+    };
+    let side = (((x1 - x0) * sx).max((y1 - y0) * sy) * margin)
         .round()
         .max(4.0) as u32;
     let corner =
@@ -159,7 +168,8 @@ pub fn bicubic(
         );
         resize(&blurred, side, side, FilterType::Triangle)
     });
-    let cut = RgbImage::from_fn(side, side, |i, j| match source_pixel(i, j).filter(inside) {
+    let shown = |pixel: &(u32, u32)| background == Background::Context || inside(pixel);
+    let cut = RgbImage::from_fn(side, side, |i, j| match source_pixel(i, j).filter(shown) {
         Some((x, y)) => *photo.get_pixel(x, y),
         None => backdrop
             .as_ref()
@@ -203,6 +213,8 @@ mod tests {
             crop(&photo, &masks, 1, bounds, 32, Surround::Neutral),
             bicubic(&photo, &masks, 1, bounds, 32, Background::Grey),
         ];
+        let surroundings = bicubic(&photo, &masks, 1, bounds, 32, Background::Context);
+        assert_eq!(at(&surroundings, 1, 16), [0.0, 255.0, 0.0]);
         for crop in [&sampled, &scaled] {
             assert_eq!(
                 [at(crop, 16, 16), at(crop, 16, 3), at(crop, 1, 16)],

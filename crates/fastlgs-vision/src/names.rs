@@ -34,6 +34,16 @@ pub fn embeddings() -> Result<Vec<Vec<f32>>> {
     Ok(embeddings)
 }
 
+/// Returns the first name of each class, in the order of [`embeddings`].
+///
+/// # Errors
+/// When the offline models are not installed.
+pub fn class_names() -> Result<Vec<String>> {
+    let lists: Vec<Vec<String>> = fs::read_json(&offline_dir().join("classes.json"))?;
+    let first = |list: Vec<String>| list.into_iter().next().unwrap_or_default();
+    Ok(lists.into_iter().map(first).collect())
+}
+
 /// Returns at most `most` words, each once: the classifier's class names, then English words of
 /// MiniLM's vocabulary, roughly in descending order of frequency.
 ///

@@ -4,20 +4,23 @@ use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
 use crate::query::{ObjectQuery, Query, Texts};
 use crate::train::{self, TrainReport};
+use crate::visibility::Visibility;
 use crate::{Result, SceneNotes, model_choice};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
-use fastlgs_grid::query::Hit;
-use fastlgs_grid::relevancy::TextQuery;
+use fastlgs_grid::relevancy::{Rule, TextQuery};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, Frame, View};
 use fastlgs_vision::{Encoder, TextEncoder};
+use image::RgbImage;
 use std::cell::OnceCell;
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+
+/// Largest distance of a rendered code from the code of its object, on a scale of 0 to 255 (paper).
+const PAPER_TAU_AC: f32 = 5.0;
 
 /// A trained scene on a device.
 pub struct Scene {
@@ -40,8 +43,8 @@ pub struct Scene {
     texts: OnceCell<Texts>,
     /// Whether taught names are used.
     use_taught_names: bool,
-    /// Cache of [`Self::most_visible_view`], by object ids.
-    best_views: BTreeMap<Vec<u16>, Option<String>>,
+    /// Which views show which objects, after the first call that needs it.
+    visibility: Option<Visibility>,
 }
 
 /// Rendered object data of a view, and what it depends on.
@@ -87,7 +90,7 @@ impl Scene {
             last_field: None,
             texts: OnceCell::new(),
             use_taught_names: true,
-            best_views: BTreeMap::new(),
+            visibility: None,
         })
     }
 
@@ -129,6 +132,14 @@ impl Scene {
         &self.trained
     }
 
+    /// How text queries rank and accept objects: as in the paper for the preset `like-paper`.
+    pub fn rule(&self) -> Rule {
+        match self.trained.preset {
+            train::Preset::LikePaper => Rule::Paper,
+            _ => Rule::Calibrated,
+        }
+    }
+
     /// Name of the device.
     pub fn adapter(&self) -> String {
         self.engine.name()
@@ -161,7 +172,7 @@ impl Scene {
     pub fn set_gaussians(&mut self, gaussians: Gaussians) -> Result<()> {
         self.engine.set_state(&State::of(&gaussians))?;
         self.gaussians = gaussians;
-        self.best_views.clear();
+        self.visibility = None;
         self.last_field = None;
         Ok(())
     }
@@ -169,7 +180,7 @@ impl Scene {
     /// Replaces the object ids of the Gaussians, one for each.
     pub(crate) fn set_object_ids(&mut self, ids: Vec<u16>) {
         self.gaussians.object_ids = ids;
-        self.best_views.clear();
+        self.visibility = None;
         self.last_field = None;
     }
 
@@ -248,7 +259,9 @@ impl Scene {
         (last.camera == *camera && last.tau_ac == tau_ac).then(|| last.field.clone())
     }
 
-    fn render_objects(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Field> {
+    pub(crate) fn render_objects(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Field> {
+        let papers = (self.rule() == Rule::Paper).then_some(PAPER_TAU_AC);
+        let tau_ac = tau_ac.or(papers);
         let has_transparent = self.trained.clear > 0;
         let view = self.view(camera).with_transparent_as_solid(has_transparent);
         self.render_field(view, tau_ac)
@@ -285,41 +298,38 @@ impl Scene {
         })
     }
 
+    /// Returns which views show which objects; the first call renders all views in a small size.
+    ///
+    /// # Errors
+    /// The device fails.
+    fn visibility(&mut self, grid: &Grid) -> Result<Visibility> {
+        match self.visibility.take() {
+            Some(known) => Ok(known),
+            None => Visibility::of(self, grid),
+        }
+    }
+
     /// Returns the name of the view that shows most pixels of some objects; `None` if no view shows
     /// them.
     ///
     /// # Errors
     /// The device fails.
     pub fn most_visible_view(&mut self, grid: &Grid, ids: &[u16]) -> Result<Option<String>> {
-        /// Longer side of the rendered views, in pixels.
-        const SEARCH_SIDE: u32 = 128;
-        if let Some(known) = self.best_views.get(ids) {
-            return Ok(known.clone());
-        }
-        let targets: Vec<Hit> = ids
-            .iter()
-            .map(|id| Hit {
-                id: *id,
-                score: 1.0,
-            })
-            .collect();
-        let mut best = (0, None);
-        for camera in self.cameras.clone() {
-            let longer = camera.width.max(camera.height);
-            let side = |v: u32| (v * SEARCH_SIDE.min(longer) / longer).max(1);
-            let small = camera.resized(side(camera.width), side(camera.height));
-            let pixels = self
-                .render_objects(&small, None)?
-                .mask(grid, &targets)
-                .iter()
-                .filter(|m| **m)
-                .count();
-            if pixels > best.0 {
-                best = (pixels, Some(camera.name));
-            }
-        }
-        self.best_views.insert(ids.to_vec(), best.1.clone());
-        Ok(best.1)
+        let visibility = self.visibility(grid)?;
+        let best = visibility.best_view(ids);
+        self.visibility = Some(visibility);
+        Ok(best.map(|view| self.cameras[view].name.clone()))
+    }
+
+    /// Returns a small picture of an object; `None` if no view shows it.
+    ///
+    /// # Errors
+    /// The device fails.
+    pub fn thumbnail(&mut self, grid: &Grid, id: u16) -> Result<Option<RgbImage>> {
+        let mut visibility = self.visibility(grid)?;
+        let picture = visibility.thumbnail(self, id);
+        self.visibility = Some(visibility);
+        picture
     }
 
     /// Returns the text encoder of the scene; the first call loads it.
@@ -335,6 +345,7 @@ impl Scene {
     /// are not used.
     fn configure_texts(&self, mut texts: Texts) -> Texts {
         texts.calibrations = self.calibrations.unwrap_or(texts.calibrations);
+        texts.rule = self.rule();
         if !self.use_taught_names {
             texts.ignore_taught_names();
         }

@@ -10,7 +10,7 @@ use crate::ui::print_line;
 use crate::words::thousands;
 use crate::{report, ui};
 use anyhow::{Result, bail};
-use fastlgs::query::answer::{AnswerReport, ObjectReport};
+use fastlgs::query::answer::{AnswerReport, NearObject, ObjectReport};
 use fastlgs::query::sheet::{self, Tile};
 use fastlgs::query::{Answer, ObjectQuery, Pixels, ViewChoice, parse_size, selection};
 use fastlgs::{Run, Scene};
@@ -35,7 +35,7 @@ pub struct Args {
     /// Texts to find, answered in turn. "wheel of the bicycle" finds a part. `-` reads one text per
     /// line from standard input and prints one line of JSON each; on a terminal, it starts a
     /// dialogue.
-    #[arg(required_unless_present_any = ["image", "point", "scenes_below"])]
+    #[arg(required_unless_present_any = ["image", "point", "object", "scenes_below"])]
     text: Vec<String>,
     /// Picture of the object to find, cut out of its surroundings.
     #[arg(long, value_name = "FILE")]
@@ -43,6 +43,9 @@ pub struct Args {
     /// Pixel of the view that shows the object to find. X,Y+X,Y gives several pixels of one object.
     #[arg(long, value_name = "X,Y")]
     point: Vec<Pixels>,
+    /// Id of the object to find, as `fastlgs objects` lists it; may be repeated.
+    #[arg(long, value_name = "ID")]
+    object: Vec<u16>,
     /// Text that must not match an object better than the query does; may be repeated.
     #[arg(long, value_name = "TEXT")]
     negative: Vec<String>,
@@ -63,7 +66,7 @@ pub struct Args {
     top_k: usize,
     /// Accepted rate of false alarms: share of absent names that are answered, 0 to 1. A larger
     /// rate also finds more present objects.
-    #[arg(long, value_name = "SHARE", default_value_t = QueryConfig::default().false_alarms, value_parser = parse_share)]
+    #[arg(long, visible_alias = "false-positive-rate", value_name = "SHARE", default_value_t = QueryConfig::default().false_alarms, value_parser = parse_share)]
     false_alarms: f32,
     /// CLIP text tower, for scenes with imported embeddings, or if the file has moved.
     #[arg(long, value_name = "FILE")]
@@ -97,8 +100,36 @@ fn parse_share(text: &str) -> Result<f32, String> {
         .ok_or_else(|| "a number from 0 to 1 is needed".into())
 }
 
+/// Formats the nearest objects of a text that is not found, and how to accept one.
+fn nearest_text(report: &AnswerReport, scene: &Path) -> Vec<String> {
+    let AnswerReport { text, nearest, .. } = report;
+    let Some(first) = nearest.first() else {
+        return Vec::new();
+    };
+    let near = |object: &NearObject| {
+        let view = object.best_view.as_ref();
+        let view = view.map_or(String::new(), |view| format!(", best view {view}"));
+        format!("#{} (confidence {:.2}{view})", object.id, object.score)
+    };
+    let near: Vec<String> = nearest.iter().map(near).collect();
+    let (scene, id) = (scene.display(), first.id);
+    let mut lines = vec![
+        format!("  nearest objects: {}", near.join(", ")),
+        format!("  to see one:    fastlgs query {scene} --object {id} -o DIR"),
+        format!("  to name it:    fastlgs teach \"{text}\" {scene} --object {id}"),
+    ];
+    // The rate at which the nearest object is found, rounded up.
+    let rate = (100.0 * (1.0 - first.score)).floor() / 100.0 + 0.01;
+    if rate < 1.0 {
+        lines.push(format!(
+            "  to accept it:  --false-alarms {rate:.2} (the share of absent names that are then answered)"
+        ));
+    }
+    lines
+}
+
 /// Formats an answer for the terminal.
-fn answer_text(report: &AnswerReport) -> String {
+fn answer_text(report: &AnswerReport, scene: &Path) -> String {
     let AnswerReport {
         text, view, score, ..
     } = report;
@@ -121,9 +152,12 @@ fn answer_text(report: &AnswerReport) -> String {
     };
     let taught = if report.taught { ", taught" } else { "" };
     if !report.found {
-        return format!(
+        let verdict = format!(
             "{text}: not found; the best object has confidence {score:.2}{calibration_note}{taught}"
         );
+        let mut lines = vec![verdict];
+        lines.extend(nearest_text(report, scene));
+        return lines.join("\n");
     }
     let count = if report.objects.len() == 1 {
         "1 object".to_owned()
@@ -223,9 +257,9 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
 
 /// Refuses options that contradict each other.
 fn check(args: &Args, reads_lines: bool, exports: bool) -> Result<()> {
-    let by_example = !args.point.is_empty() || !args.image.is_empty();
+    let by_example = !args.point.is_empty() || !args.image.is_empty() || !args.object.is_empty();
     if by_example && !args.text.is_empty() {
-        bail!("query in one way: by text, by --point or by --image");
+        bail!("query in one way: by text, by --point, by --image or by --object");
     }
     if reads_lines && args.text.len() > 1 {
         bail!("'-' reads all texts from standard input; leave out other texts");
@@ -251,9 +285,10 @@ fn search_library(root: &Path, args: &Args, common: &ui::Common, run: &Run) -> R
         bail!("--library: give a text to find, or '-' to read texts from standard input");
     }
     let writes = args.output.is_some() || args.export.is_some() || args.export_rest.is_some();
-    if !args.image.is_empty() || !args.point.is_empty() || writes {
+    let by_example = !args.image.is_empty() || !args.point.is_empty() || !args.object.is_empty();
+    if by_example || writes {
         bail!(
-            "--library accepts only texts; query a single scene for pictures, pixels, exports and output files"
+            "--library accepts only texts; query a single scene for pictures, pixels, ids, exports and output files"
         );
     }
     if args.views.is_given() || args.heatmap || args.dilate.is_some() || args.tau_ac.is_some() {
@@ -286,7 +321,8 @@ impl QueryRunner<'_> {
             .map(picture)
             .collect::<Result<Vec<_>>>()?;
         let points = self.args.point.iter().cloned().map(ObjectQuery::Point);
-        let queries: Vec<ObjectQuery> = texts.chain(pictures).chain(points).collect();
+        let ids = self.args.object.iter().copied().map(ObjectQuery::Object);
+        let queries: Vec<ObjectQuery> = texts.chain(pictures).chain(points).chain(ids).collect();
         if queries.len() > 1 && (self.args.export.is_some() || self.args.export_rest.is_some()) {
             bail!("--export and --export-rest need a single query; leave out the others");
         }
@@ -304,9 +340,9 @@ impl QueryRunner<'_> {
         } else if common.json.is_some() {
             report::write_fields(common, &answers)?;
         } else if !common.quiet {
-            answers
-                .iter()
-                .for_each(|answer| print_line!("{}", answer_text(answer)));
+            answers.iter().for_each(|answer| {
+                print_line!("{}", answer_text(answer, &self.scene.folder().root))
+            });
             sheet
                 .iter()
                 .for_each(|path| print_line!("contact sheet: {}", path.display()));
@@ -419,9 +455,28 @@ impl QueryRunner<'_> {
             let report = &answer.report;
             self.tiles
                 .push(Tile::new(&picture, &report.text, caption(report)));
+            let nearest = answer.report.nearest.clone();
+            self.add_nearest_tiles(&answer.report.text, nearest)?;
         }
         self.export(&answer)?;
         Ok(answer.report)
+    }
+
+    /// Adds a tile for each of the nearest objects of a text that is not found.
+    fn add_nearest_tiles(&mut self, text: &str, nearest: Vec<NearObject>) -> Result<()> {
+        // Several views have one row of the sheet each, with a tile for each query.
+        if self.cameras.len() > 1 {
+            return Ok(());
+        }
+        for object in nearest {
+            if let Some(picture) = self.scene.thumbnail(&self.grid, object.id)? {
+                let title = format!("{text}? #{}", object.id);
+                let view = object.best_view.unwrap_or_default();
+                let note = format!("not found, {:.2}, in {view}", object.score);
+                self.tiles.push(Tile::new(&picture, title, note));
+            }
+        }
+        Ok(())
     }
 
     /// Writes the Gaussians of an answer to `--export`, and all others to `--export-rest`.

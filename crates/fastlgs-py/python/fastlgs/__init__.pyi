@@ -120,6 +120,9 @@ class Answer:
     @property
     def objects(self) -> List[FoundObject]: ...
     @property
+    def nearest(self) -> List[Dict[str, Any]]:
+        """Nearest objects if nothing was found, at most three: id, score and best_view of each."""
+    @property
     def report(self) -> Dict[str, Any]:
         """The report of the answer, as `fastlgs query --json` prints it."""
     def __bool__(self) -> bool: ...
@@ -159,11 +162,12 @@ class Scene:
         view: Optional[View] = None,
         point: Union[None, Tuple[int, int], Sequence[Tuple[int, int]]] = None,
         image: Optional[NDArray[np.uint8]] = None,
+        object: Optional[int] = None,
         negatives: Sequence[str] = (),
         false_alarms: Optional[float] = None,
         top_k: Optional[int] = None,
     ) -> Answer:
-        """Finds objects by a text, by pixels of the view, or by a picture.
+        """Finds objects by a text, by pixels of the view, by a picture, or by the id of an object.
 
         `point` is one pixel (x, y), or several pixels of one object. `image` is uint8
         (height, width, 3).
@@ -171,6 +175,11 @@ class Scene:
     @property
     def objects(self) -> List[Object]:
         """All objects and parts."""
+    def list_objects(self, names: int = 3) -> List[Dict[str, Any]]:
+        """Lists all objects and parts with their likeliest names, the largest first.
+
+        Each has the fields that `fastlgs objects --json` prints.
+        """
     def embeddings(self, id: int) -> NDArray[np.float32]:
         """Returns the embeddings of an object's masks, (masks, numbers).
 

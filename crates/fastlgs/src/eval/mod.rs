@@ -75,6 +75,13 @@ pub struct EvalReport {
     pub labels_total: usize,
     /// mIoU of the answers with the labels.
     pub miou: Option<f64>,
+    /// mIoU of the first-ranked object, whether it was found or not. Benchmarks without absent names
+    /// (LERF, 3D-OVS) accept it always.
+    pub first_miou: Option<f64>,
+    /// Recall of the first-ranked object, whether it was found or not.
+    pub first_macc: Option<f64>,
+    /// Boundary IoU of the first-ranked object, whether it was found or not.
+    pub first_boundary_iou: Option<f64>,
     /// mIoU by label.
     pub miou_by_label: BTreeMap<String, Option<f64>>,
     /// Recall: share of the pixels of a label that the answer covers.
@@ -173,6 +180,9 @@ struct Sums {
     apart: Vec<f64>,
     recall: Vec<f64>,
     boundary: Vec<f64>,
+    first_iou: Vec<f64>,
+    first_recall: Vec<f64>,
+    first_boundary: Vec<f64>,
     oracle_boundary: Vec<f64>,
     localised: Vec<f64>,
     top1: Vec<f64>,
@@ -237,7 +247,8 @@ pub fn eval_scene(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport> {
         adapter: scene.adapter(),
         ..EvalReport::default()
     };
-    let report = with_absent(report, &absent, &colored, &query, &sums.present);
+    let min_score = query.min_score(scene.rule());
+    let report = with_absent(report, &absent, &colored, min_score, &sums.present);
     Ok(with_labels(report, sums))
 }
 
@@ -284,16 +295,17 @@ fn score_views(
     Ok(sums)
 }
 
-/// Adds the results of absent names to a report. `present` holds the scores of the labels.
+/// Adds the results of absent names to a report. Those with at least `min_score` are answered.
+/// `present` holds the scores of the labels.
 fn with_absent(
     report: EvalReport,
     absent: &[(String, f64)],
     colored: &[(String, f64)],
-    query: &QueryConfig,
+    min_score: f32,
     present: &[f64],
 ) -> EvalReport {
     let rejected = |names: &[(String, f64)]| {
-        let is_rejected = |name: &&(String, f64)| name.1 < f64::from(query.min_score());
+        let is_rejected = |name: &&(String, f64)| name.1 < f64::from(min_score);
         names.iter().filter(is_rejected).count()
     };
     let scores: Vec<f64> = absent.iter().map(|a| a.1).collect();
@@ -333,6 +345,9 @@ fn with_labels(report: EvalReport, sums: Sums) -> EvalReport {
     EvalReport {
         labels_scored: sums.iou.len(),
         miou: mean(&sums.iou),
+        first_miou: mean(&sums.first_iou),
+        first_macc: mean(&sums.first_recall),
+        first_boundary_iou: mean(&sums.first_boundary),
         miou_by_label: by_label(&sums.by_label),
         macc: mean(&sums.recall),
         boundary_iou: mean(&sums.boundary),
@@ -431,13 +446,10 @@ fn score_label(
     // in the label.
     let (oracle, found, id) = best_object(grid, field, &truth);
     let rank = ranked.iter().position(|h| h.id == id);
-    let is_within = |id: u16| {
-        let mask = field.mask(grid, &[Hit { id, score: 0.0 }]);
-        let covered = mask.iter().zip(&truth).filter(|(m, _)| **m);
-        let (hit, all) = covered.fold((0, 0), |(h, a), (_, t)| (h + usize::from(*t), a + 1));
-        all > 0 && 2 * hit > all
-    };
-    let is_first = ranked.first().is_some_and(|first| is_within(first.id));
+    let first = field.mask(grid, ranked.get(..1).unwrap_or_default());
+    let covered = first.iter().zip(&truth).filter(|(m, _)| **m);
+    let (hit, all) = covered.fold((0, 0), |(h, a), (_, t)| (h + usize::from(*t), a + 1));
+    let is_first = all > 0 && 2 * hit > all;
     let outcome = match targets.first() {
         None => Outcome::Refused,
         _ if iou >= MIN_RIGHT_IOU => Outcome::Right,
@@ -451,6 +463,10 @@ fn score_label(
     sums.recall.push(metrics::recall(&mask, &truth));
     sums.boundary
         .push(metrics::boundary_iou(&mask, &truth, w, h, band));
+    sums.first_iou.push(metrics::iou(&first, &truth));
+    sums.first_recall.push(metrics::recall(&first, &truth));
+    sums.first_boundary
+        .push(metrics::boundary_iou(&first, &truth, w, h, band));
     sums.localised.push(f64::from(u8::from(peak)));
     sums.labels.push(name());
     sums.present.push(f64::from(query::best_score(&ranked)));

@@ -17,6 +17,8 @@ use std::time::Instant;
 
 /// Default number of objects that a report lists as candidates.
 pub const CANDIDATES: usize = 8;
+/// Largest number of objects that a report lists as nearest.
+const MAX_NEAREST: usize = 3;
 /// Number of pixels below which an answer counts as hardly visible in a view.
 const MIN_VISIBLE_PIXELS: usize = 30;
 
@@ -42,6 +44,8 @@ pub struct AnswerReport {
     pub objects: Vec<ObjectReport>,
     /// Objects of the highest ranks, targets or not.
     pub candidates: Vec<Hit>,
+    /// Nearest objects, if nothing was found; see [`Self::find_nearest`].
+    pub nearest: Vec<NearObject>,
     /// Number of pixels in the mask.
     pub pixels: usize,
     /// View that shows the answer best, if this view hardly shows it; see [`Self::find_best_view`].
@@ -59,6 +63,25 @@ pub struct AnswerReport {
 }
 
 impl AnswerReport {
+    /// Sets `nearest` to the objects of the highest ranks, at most three, if nothing was found.
+    ///
+    /// # Errors
+    /// The device fails.
+    pub fn find_nearest(&mut self, scene: &mut Scene, grid: &Grid, ranked: &[Hit]) -> Result<()> {
+        if self.found {
+            return Ok(());
+        }
+        for &Hit { id, score } in ranked.iter().take(MAX_NEAREST) {
+            let best_view = scene.most_visible_view(grid, &[id])?;
+            self.nearest.push(NearObject {
+                id,
+                score,
+                best_view,
+            });
+        }
+        Ok(())
+    }
+
     /// Sets `seen_best` if this view shows fewer than 30 pixels of the answer.
     ///
     /// # Errors
@@ -78,6 +101,17 @@ impl AnswerReport {
         }
         Ok(())
     }
+}
+
+/// An object that is near to a query, but not near enough to answer it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct NearObject {
+    /// Object id.
+    pub id: u16,
+    /// Score, 0 to 1.
+    pub score: f32,
+    /// View that shows most of it.
+    pub best_view: Option<String>,
 }
 
 /// One object of an answer.
@@ -202,6 +236,7 @@ impl Answer {
                 .collect(),
             candidates: ranked[..ranked.len().min(candidates)].to_vec(),
             pixels: self.mask.iter().filter(|m| **m).count(),
+            nearest: Vec::new(),
             seen_best: None,
             mask: None,
             heatmap: None,

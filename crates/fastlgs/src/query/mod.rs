@@ -185,6 +185,8 @@ impl<'a> Query<'a> {
             ms,
         );
         answer.report.find_best_view(scene, &answer.grid)?;
+        let ranked = &answer.found.ranked;
+        answer.report.find_nearest(scene, &answer.grid, ranked)?;
         Ok(answer)
     }
 }

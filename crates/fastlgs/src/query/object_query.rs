@@ -2,6 +2,7 @@
 
 use super::{Pixels, Texts, phrase, texts};
 use crate::error::{Context, bail};
+use crate::teach::no_object;
 use crate::{Result, Scene};
 use fastlgs_core::{Camera, LabelMap};
 use fastlgs_grid::Grid;
@@ -20,6 +21,8 @@ pub enum ObjectQuery {
     Image(String, RgbImage),
     /// Pixels of the view that show one object.
     Point(Pixels),
+    /// Id of the object.
+    Object(u16),
 }
 
 /// An embedded query, which does not depend on a view yet.
@@ -28,6 +31,8 @@ pub enum EmbeddedQuery {
     Embedded(Box<Embedded>),
     /// Pixels of the view that show one object.
     Point(Pixels),
+    /// Id of an object of the scene.
+    Object(u16),
 }
 
 /// Embeddings of a text or picture. For "A of B", `split` holds the queries of B and A.
@@ -43,17 +48,25 @@ impl ObjectQuery {
             Self::Text(text) => text.clone(),
             Self::Image(name, _) => name.clone(),
             Self::Point(pixels) => pixels.to_string(),
+            Self::Object(id) => format!("object {id}"),
         }
     }
 
     /// Embeds a text or picture. An object that fits one of the `negatives` at least as well as the
-    /// query is never a target. For pixels, `negatives` have no effect.
+    /// query is never a target. For pixels and ids, `negatives` have no effect.
     ///
     /// # Errors
-    /// A text or picture that cannot be embedded.
+    /// A text or picture that cannot be embedded, or an id that the scene does not have.
     pub fn embed(&self, scene: &Scene, negatives: &[String]) -> Result<EmbeddedQuery> {
         Ok(match self {
             Self::Point(pixels) => EmbeddedQuery::Point(pixels.clone()),
+            Self::Object(id) => {
+                let grid = scene.grid()?;
+                if !(1..=grid.objects.len()).contains(&usize::from(*id)) {
+                    return Err(no_object(&scene.folder().root, &grid, *id));
+                }
+                EmbeddedQuery::Object(*id)
+            }
             Self::Image(name, photo) => {
                 let whole = picture_query(scene, name, photo)?;
                 let whole = if negatives.is_empty() {
@@ -186,16 +199,16 @@ pub(crate) fn picture_query(scene: &Scene, name: &str, photo: &RgbImage) -> Resu
 }
 
 impl EmbeddedQuery {
-    /// Returns whether scores rest on a measured calibration. Pixels need none.
+    /// Returns whether scores rest on a measured calibration. Pixels and ids need none.
     pub fn is_calibrated(&self) -> bool {
         match self {
             Self::Embedded(meant) => meant.phrase_query.calibration.measured,
-            Self::Point(..) => true,
+            Self::Point(..) | Self::Object(_) => true,
         }
     }
 
     /// Ranks objects and selects the targets. For pixels, the ranking lists the objects there,
-    /// smallest first, with their support as score.
+    /// smallest first, with their support as score. For an id, the object has its support, too.
     ///
     /// # Errors
     /// A pixel outside the view.
@@ -206,6 +219,10 @@ impl EmbeddedQuery {
         camera: &Camera,
         config: &QueryConfig,
     ) -> Result<Found> {
+        let hit = |id: u16| Hit {
+            id,
+            score: grid.objects[usize::from(id) - 1].support,
+        };
         match self {
             Self::Embedded(meant) => Ok(meant.find(grid, config)),
             Self::Point(pixels) => {
@@ -218,15 +235,15 @@ impl EmbeddedQuery {
                 }
                 let (at_pixels, selected) =
                     query::select_at_pixels(grid, &field.at(grid, pixels.all()));
-                let hit = |id: u16| Hit {
-                    id,
-                    score: grid.objects[usize::from(id) - 1].support,
-                };
                 Ok(Found {
                     ranked: at_pixels.into_iter().map(hit).collect(),
                     targets: selected.map(hit).into_iter().collect(),
                 })
             }
+            Self::Object(id) => Ok(Found {
+                ranked: vec![hit(*id)],
+                targets: vec![hit(*id)],
+            }),
         }
     }
 }

@@ -18,6 +18,18 @@ pub fn gaussians(scene: &Gaussians, grid: &Grid, objects: &[u16]) -> Vec<usize> 
         .collect()
 }
 
+/// Returns the indices of the Gaussians of each object, in order of id. Those of an object include
+/// those of its parts.
+pub fn gaussians_by_object(scene: &Gaussians, grid: &Grid) -> Vec<Vec<usize>> {
+    let mut own: Vec<Vec<usize>> = vec![Vec::new(); grid.objects.len()];
+    for (i, id) in scene.object_ids.iter().enumerate() {
+        for object in grid.chain(*id) {
+            own[usize::from(object) - 1].push(i);
+        }
+    }
+    own
+}
+
 /// Writes Gaussians in the format of the file extension: with `keep`, those with the indices
 /// `selected`, else all others.
 ///

@@ -20,7 +20,16 @@ impl Tile {
     /// Creates a tile from an image of any size. Title and note may be empty.
     pub fn new(picture: &RgbImage, title: impl Into<String>, note: impl Into<String>) -> Self {
         Self {
-            picture: fitted(picture),
+            picture: fitted(picture, IMAGE_SIDE),
+            title: title.into(),
+            note: note.into(),
+        }
+    }
+
+    /// Creates a small tile, for sheets with many images.
+    pub fn small(picture: &RgbImage, title: impl Into<String>, note: impl Into<String>) -> Self {
+        Self {
+            picture: fitted(picture, SMALL_IMAGE_SIDE),
             title: title.into(),
             note: note.into(),
         }
@@ -54,6 +63,8 @@ pub fn view_tiles(
 
 /// Longer side of an image on the sheet, in pixels.
 const IMAGE_SIDE: u32 = 320;
+/// Longer side of an image of a small tile, in pixels.
+const SMALL_IMAGE_SIDE: u32 = 128;
 /// Space between images, in pixels.
 const GAP: u32 = 10;
 /// Font sizes of title and note, in pixels.
@@ -110,14 +121,14 @@ pub fn sheet(tiles: &[Tile], columns: usize) -> RgbImage {
     page
 }
 
-/// Scales an image so that its longer side is [`IMAGE_SIDE`].
-fn fitted(picture: &RgbImage) -> RgbImage {
-    let scale = IMAGE_SIDE as f32 / picture.width().max(picture.height()).max(1) as f32;
-    let side = |pixels: u32| ((pixels as f32 * scale).round() as u32).max(1);
+/// Scales an image so that its longer side has `side` pixels.
+fn fitted(picture: &RgbImage, side: u32) -> RgbImage {
+    let scale = side as f32 / picture.width().max(picture.height()).max(1) as f32;
+    let scaled = |pixels: u32| ((pixels as f32 * scale).round() as u32).max(1);
     resize(
         picture,
-        side(picture.width()),
-        side(picture.height()),
+        scaled(picture.width()),
+        scaled(picture.height()),
         FilterType::Triangle,
     )
 }

@@ -2,14 +2,16 @@
 
 use crate::calibrations::{self, Calibrations};
 use crate::error::{Context, bail};
+use crate::everyday::EVERYDAY;
 use crate::names::Names;
 use crate::query::phrase;
 use crate::{Result, model_choice};
 use fastlgs_core::SceneFolder;
-use fastlgs_core::scene_folder::Manifest;
+use fastlgs_core::fs::cache_dir;
+use fastlgs_core::scene_folder::{Manifest, load_tensors, save_tensors};
 use fastlgs_grid::Grid;
-use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
-use fastlgs_vision::TextEncoder;
+use fastlgs_grid::relevancy::{CANONICAL, Rule, TextQuery};
+use fastlgs_vision::{TextEncoder, names};
 use std::path::Path;
 
 /// Checks that the embeddings of the objects can be compared with those of `what` (texts or
@@ -41,12 +43,24 @@ pub(super) fn check_embeddings(
     Ok(())
 }
 
+/// Returns a hash of texts and of their encoder, which `embeddings` of it identify.
+fn fingerprint(embeddings: &[f32], texts: &str) -> u64 {
+    let values = embeddings.iter().flat_map(|v| v.to_bits().to_le_bytes());
+    let bytes = values.chain(texts.bytes());
+    // FNV-1a.
+    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
+    })
+}
+
 /// A loaded text encoder.
 pub struct Texts {
     encoder: Box<dyn TextEncoder>,
     canonical: Vec<Vec<f32>>,
     /// Calibrations of the encoder.
     pub calibrations: Calibrations,
+    /// How text queries rank and accept objects.
+    pub rule: Rule,
     names: Names,
     identity: String,
 }
@@ -93,6 +107,7 @@ impl Texts {
             encoder,
             canonical,
             calibrations,
+            rule: Rule::default(),
             names: Names::load()?,
             identity,
         })
@@ -169,6 +184,49 @@ impl Texts {
             .collect()
     }
 
+    /// Returns names that objects may have, with their queries: taught names, and the classes of the
+    /// offline encoder or everyday names.
+    ///
+    /// # Errors
+    /// Inference fails, or the offline models are not installed.
+    pub fn vocabulary(&self) -> Result<Vec<(String, TextQuery)>> {
+        let (names, embeddings) = if self.canonical.is_empty() {
+            (names::class_names()?, names::embeddings()?)
+        } else {
+            let names: Vec<String> = EVERYDAY.map(str::to_owned).into();
+            (names, self.everyday_embeddings()?)
+        };
+        let taught = self.taught().into_iter();
+        let taught = taught.filter_map(|name| Some((name.clone(), self.example_query(&name)?)));
+        let known = names.into_iter().zip(embeddings);
+        let known = known.map(|(name, embedding)| {
+            let query = self.embedded_query(&name, embedding);
+            (name, query)
+        });
+        Ok(taught.chain(known).collect())
+    }
+
+    /// Returns the embeddings of everyday names. They are saved in the cache folder, because CLIP
+    /// takes half a minute for them on two cores.
+    fn everyday_embeddings(&self) -> Result<Vec<Vec<f32>>> {
+        let key = fingerprint(&self.canonical.concat(), &EVERYDAY.concat());
+        let path = cache_dir()
+            .join("names")
+            .join(format!("{key:016x}.safetensors"));
+        let cached = load_tensors(&path).ok().and_then(|mut t| t.remove("names"));
+        if let Some((shape, values)) =
+            cached.filter(|(shape, _)| shape.first() == Some(&EVERYDAY.len()))
+        {
+            return Ok(values.chunks_exact(shape[1]).map(<[f32]>::to_vec).collect());
+        }
+        let embeddings = self.encoder.embed(&EVERYDAY)?;
+        let shape = vec![EVERYDAY.len(), embeddings[0].len()];
+        if let Err(e) = save_tensors(&path, &[("names", shape, &embeddings.concat())]) {
+            tracing::debug!("the embeddings of everyday names cannot be saved: {e}");
+        }
+        Ok(embeddings)
+    }
+
     /// Adds negative texts to a query. An object that fits one of them at least as well as the
     /// query is never a target.
     ///
@@ -209,6 +267,7 @@ impl Texts {
         TextQuery {
             canonical: self.canonical.clone(),
             min_canonical: anything,
+            rule: self.rule,
             ..TextQuery::new(vec![embedding], calibration)
         }
     }

@@ -74,7 +74,7 @@ impl QueryRunner<'_> {
                 Command::Text(text) => {
                     last = Some(text.to_owned());
                     self.answer(&ObjectQuery::Text(text.to_owned()), 0)
-                        .map(|report| answer_text(&report))
+                        .map(|report| answer_text(&report, &self.scene.folder().root))
                 }
             };
             match reply {
@@ -115,7 +115,7 @@ impl QueryRunner<'_> {
         let (report, sheet) = saved?;
         Ok(format!(
             "{}\ncontact sheet: {}",
-            answer_text(&report),
+            answer_text(&report, &self.scene.folder().root),
             sheet.display()
         ))
     }
