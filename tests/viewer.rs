@@ -171,7 +171,12 @@ fn the_interface_answers_as_the_query_command_does() {
     let huge = format!(r#"{{"image":"{}"}}"#, "A".repeat(9 << 20));
     for (path, body, status, word) in [
         ("/api/query", "{", 400, "JSON"),
-        ("/api/query", "{}", 400, "one of text, point, image and object"),
+        (
+            "/api/query",
+            "{}",
+            400,
+            "one of text, point, image and object",
+        ),
         ("/api/query", r#"{"text":" "}"#, 400, "empty"),
         ("/api/query", long.as_str(), 400, "301 characters"),
         ("/api/query", r#"{"txt":"cat"}"#, 422, "txt"),

@@ -103,6 +103,14 @@ impl Console {
         }
     }
 
+    /// Hides the bar while something is printed.
+    fn without_bar(&self, print: impl FnOnce()) {
+        match self.stages().values().next() {
+            Some(stage) => stage.bar.suspend(print),
+            None => print(),
+        }
+    }
+
     fn finish(&self, stage: &'static str) {
         if let Some(stage) = self.stages().remove(stage) {
             stage.bar.finish_and_clear();
@@ -135,14 +143,10 @@ impl Sink for Console {
                 );
             }
             Message::Finished { stage } => self.finish(stage),
-            Message::Warning(text) => {
-                // Hides the bar while the warning is printed.
-                let stages = self.stages();
-                match stages.values().next() {
-                    Some(stage) => stage.bar.suspend(|| tracing::warn!("{text}")),
-                    None => tracing::warn!("{text}"),
-                }
+            Message::Note(text) if self.medium != Medium::Nothing => {
+                self.without_bar(|| eprintln!("{text}"));
             }
+            Message::Warning(text) => self.without_bar(|| tracing::warn!("{text}")),
             _ => {}
         }
     }

@@ -138,12 +138,14 @@ fn print_config(program: clap::Command, arguments: Vec<OsString>) -> anyhow::Res
     Ok(Outcome::Done)
 }
 
-/// Starts logging and sets the environment variables of graphics drivers.
+/// Starts logging, chooses the hardware for models, and sets the environment variables of graphics
+/// drivers.
 pub fn init_process(common: &ui::Common) {
     // SAFETY: no other thread runs yet, so none can read the environment.
     // Mesa's device selection layer contacts the desktop session and prints errors without one.
     unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
     ui::start_logging(common);
+    common.onnx.choose();
 }
 
 /// Converts the result of a command to an exit code. Prints an error as one sentence.

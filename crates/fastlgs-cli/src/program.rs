@@ -48,7 +48,6 @@ const VISIBLE_OPTIONS: [(&str, &[&str]); 5] = [
             "output",
             "view",
             "point",
-            "image",
             "object",
             "heatmap",
             "export",

@@ -42,7 +42,8 @@ fn reference() -> String {
 }
 
 fn is_hidden_global(arg: &Arg) -> bool {
-    arg.get_id() == "seed" || config_file::CONFIG_OPTIONS.contains(&arg.get_id().as_str())
+    ["seed", "onnx"].contains(&arg.get_id().as_str())
+        || config_file::CONFIG_OPTIONS.contains(&arg.get_id().as_str())
 }
 
 fn section(out: &mut String, command: &Command, name: &str) {

@@ -1,7 +1,9 @@
 //! Options of all commands, and logging.
 
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use fastlgs::Run;
 use fastlgs::progress::Sink;
+use fastlgs_vision::Provider;
 use std::io::IsTerminal;
 use std::path::PathBuf;
 use tracing_subscriber::EnvFilter;
@@ -25,6 +27,16 @@ pub struct Common {
     /// `auto` uses a graphics card if there is one, else `cpu`.
     #[arg(long, default_value = "auto", global = true, env = "FASTLGS_DEVICE")]
     pub device: String,
+    /// Hardware for the models, through ONNX Runtime. `auto` uses CUDA, CoreML or DirectML if the
+    /// library has it and it works, else the processor.
+    #[arg(long, value_name = "PROVIDER", default_value = "auto", global = true, hide = true, env = "FASTLGS_ONNX",
+        value_parser = PossibleValuesParser::new(Provider::NAMES).map(provider))]
+    pub onnx: Provider,
+}
+
+/// Returns the provider of a name that was checked before.
+fn provider(name: String) -> Provider {
+    Provider::by_name(&name).unwrap_or_default()
 }
 
 impl Common {

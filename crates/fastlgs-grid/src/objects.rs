@@ -149,7 +149,7 @@ fn supported(
 ) -> Vec<(Proposal, Support)> {
     let mut left: Vec<(Proposal, Support)> = Vec::new();
     for (set, support) in sets.into_iter().zip(support) {
-        if support.areas.len() < config.min_views {
+        if support.views.len() < config.min_views {
             dropped[0] += 1;
         } else if support.iou < config.min_support {
             dropped[1] += 1;
@@ -209,6 +209,7 @@ impl SetsByGaussian {
 mod tests {
     use super::*;
     use crate::observations::Observation;
+    use crate::support::ViewSupport;
 
     /// Returns the objects of sets of 20 Gaussians with these supports. Each Gaussian covers 100
     /// pixels in each of four views of 10,000.
@@ -224,7 +225,13 @@ mod tests {
             .collect();
         let support = |(set, iou): &(std::ops::Range<u32>, f32)| Support {
             iou: *iou,
-            areas: (0..4).map(|v| (100 * set.len() as u32, v)).collect(),
+            views: (0..4)
+                .map(|view| ViewSupport {
+                    view,
+                    pixels: 100 * set.len() as u32,
+                    iou: *iou,
+                })
+                .collect(),
         };
         choose(
             &Observations::new(20, vec![seen], &[table]),

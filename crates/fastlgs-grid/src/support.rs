@@ -9,9 +9,19 @@ use rayon::prelude::*;
 pub struct Support {
     /// Mean IoU with the best mask of each view, weighted by the set's pixels there; 0 to 1.
     pub iou: f32,
-    /// (pixels, view) of each view that shows at least
-    /// [`MIN_PIXELS`](crate::observations::MIN_PIXELS) of it.
-    pub areas: Vec<(u32, u32)>,
+    /// Each view that shows at least [`MIN_PIXELS`](crate::observations::MIN_PIXELS) of it.
+    pub views: Vec<ViewSupport>,
+}
+
+/// Support of a set of Gaussians in a view.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ViewSupport {
+    /// Index of the view.
+    pub view: u32,
+    /// Number of pixels of the set.
+    pub pixels: u32,
+    /// IoU with the best mask, 0 to 1.
+    pub iou: f32,
 }
 
 /// Computes the support of each set.
@@ -26,9 +36,13 @@ pub fn support(observations: &Observations, sets: &[Proposal]) -> Vec<Support> {
         });
         Support {
             iou: common / pixels.max(1.0),
-            areas: shown
+            views: shown
                 .iter()
-                .map(|s| (s.pixels.round() as u32, s.view))
+                .map(|s| ViewSupport {
+                    view: s.view,
+                    pixels: s.pixels.round() as u32,
+                    iou: s.best.map_or(0.0, |best| best.iou),
+                })
                 .collect(),
         }
     };
@@ -70,6 +84,11 @@ mod tests {
             found.iter().map(|s| s.iou).collect::<Vec<_>>(),
             [1.0, 0.5, 1.0, 0.0, 0.8]
         );
-        assert_eq!(found[2].areas, [(400, 0), (400, 1), (400, 2)]);
+        let expected = [0, 1, 2].map(|view| ViewSupport {
+            view,
+            pixels: 400,
+            iou: 1.0,
+        });
+        assert_eq!(found[2].views, expected);
     }
 }

@@ -53,10 +53,19 @@ pub struct TrainerConfig {
     pub lambda: f32,
     /// Weight of the feature loss.
     pub feature_weight: f32,
+    /// Share of the iterations after which density control begins.
+    #[serde(default = "default_refine_from")]
+    pub refine_from: f32,
     /// Share of the iterations after which growth ends.
     pub refine_until: f32,
     /// Share of the iterations, from the start, that run at half the resolution.
     pub coarse_until: f32,
+    /// Weight of the mean opacity in the loss, in standard deviations of the photos' brightness.
+    #[serde(default = "default_mean_opacity_weight")]
+    pub mean_opacity_weight: f32,
+    /// Share of the Gaussians that the last step drops if photos are few (DropGaussian).
+    #[serde(default = "default_max_dropout")]
+    pub max_dropout: f32,
     /// 2-D Mip filter: lowers opacity to compensate for the dilation of small Gaussians.
     pub antialias: bool,
     /// Background colour.
@@ -74,6 +83,23 @@ pub struct TrainerConfig {
     pub couples_at: Option<u32>,
 }
 
+impl TrainerConfig {
+    /// Returns this configuration with the schedule of 3DGS: full resolution, growth from step 500
+    /// to the middle of 30,000 steps, opacity resets instead of a price on opacity, and nothing for
+    /// few photos.
+    #[must_use]
+    pub fn with_schedule_of_3dgs(self) -> Self {
+        Self {
+            refine_from: 500.0 / 30_000.0,
+            refine_until: 0.5,
+            coarse_until: 0.0,
+            mean_opacity_weight: 0.0,
+            max_dropout: 0.0,
+            ..self
+        }
+    }
+}
+
 impl Default for TrainerConfig {
     fn default() -> Self {
         Self {
@@ -85,8 +111,11 @@ impl Default for TrainerConfig {
             first_degree: 0,
             lambda: 0.2,
             feature_weight: 1.0,
+            refine_from: default_refine_from(),
             refine_until: 0.4,
             coarse_until: 0.4,
+            mean_opacity_weight: default_mean_opacity_weight(),
+            max_dropout: default_max_dropout(),
             antialias: false,
             background: [0.0; 3],
             learn_background: false,
@@ -98,7 +127,10 @@ impl Default for TrainerConfig {
 }
 
 /// Share of the iterations after which density control begins.
-const REFINE_FROM: f32 = 0.05;
+fn default_refine_from() -> f32 {
+    0.05
+}
+
 /// Target number of rounds of density control in a run, within the limits of `BETWEEN_ROUNDS`.
 const DENSITY_ROUNDS: u32 = 16;
 /// Smallest and largest number of steps between two rounds. After fewer steps, mean gradients are
@@ -112,15 +144,20 @@ const PRUNE_AFTER: [f32; 2] = [0.05, 0.25];
 /// Shares of the iterations at which cameras are aligned: after shapes have formed, and early
 /// enough for the scene to adapt.
 const ALIGN_AT: [f32; 4] = [0.3, 0.45, 0.6, 0.75];
-/// Weight of the mean opacity in the loss, in standard deviations of the photos' brightness.
+/// Weight of the mean opacity in the loss.
 ///
 /// The loss is a difference of brightness, so a fixed weight that suits bright photos would remove
 /// what dark photos show. The weight replaces opacity resets, from which runs of a few thousand
 /// steps would not recover. It applies until the first removal, so that Gaussians that no photo
 /// needs fade before.
-const MEAN_OPACITY_WEIGHT: f32 = 0.04;
-/// Share of the Gaussians that the last step drops if photos are few (DropGaussian).
-const MAX_DROPOUT: f32 = 0.2;
+fn default_mean_opacity_weight() -> f32 {
+    0.04
+}
+
+/// Share of the Gaussians that the last step drops if photos are few.
+fn default_max_dropout() -> f32 {
+    0.2
+}
 
 impl TrainerConfig {
     /// Returns the share of the run that is done at a step.
@@ -168,7 +205,7 @@ impl TrainerConfig {
     /// overfits less.
     pub(crate) fn dropout(&self, iteration: u32, views: usize) -> f32 {
         if views < FEW_VIEWS && self.channels.color() {
-            MAX_DROPOUT * self.progress(iteration)
+            self.max_dropout * self.progress(iteration)
         } else {
             0.0
         }
@@ -183,7 +220,7 @@ impl TrainerConfig {
     fn between_rounds(&self) -> u32 {
         let growing = self
             .step_at(self.refine_until)
-            .saturating_sub(self.step_at(REFINE_FROM));
+            .saturating_sub(self.step_at(self.refine_from));
         (growing / DENSITY_ROUNDS).clamp(BETWEEN_ROUNDS[0], BETWEEN_ROUNDS[1])
     }
 
@@ -194,7 +231,10 @@ impl TrainerConfig {
 
     /// Returns whether a round of density control follows when `iteration` steps are done.
     pub(crate) fn refines(&self, iteration: u32) -> bool {
-        let (from, until) = (self.step_at(REFINE_FROM), self.step_at(self.refine_until));
+        let (from, until) = (
+            self.step_at(self.refine_from),
+            self.step_at(self.refine_until),
+        );
         let due = iteration
             .checked_sub(from)
             .is_some_and(|since| since.is_multiple_of(self.between_rounds()));
@@ -233,7 +273,7 @@ impl TrainerConfig {
             self.channels.color() && iteration < self.step_at(self.refine_until + PRUNE_AFTER[0]);
         let each = 1.0 / gaussians as f32;
         if fades {
-            MEAN_OPACITY_WEIGHT * contrast * each
+            self.mean_opacity_weight * contrast * each
         } else {
             0.0
         }
@@ -243,6 +283,32 @@ impl TrainerConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_schedule_of_3dgs() {
+        let config = TrainerConfig {
+            iterations: 30_000,
+            budget: Budget::Fixed(1_000_000),
+            sh_degree: 3,
+            ..TrainerConfig::default()
+        }
+        .with_schedule_of_3dgs();
+        let steps = |happens: &dyn Fn(u32) -> bool| -> Vec<u32> {
+            (1..=30_000).filter(|i| happens(*i)).collect()
+        };
+        let refines = steps(&|i| config.refines(i));
+        assert_eq!((refines[0], refines[1], refines[145]), (500, 600, 15_000));
+        assert_eq!(refines.len(), 146);
+        let resets = steps(&|i| config.resets_opacity(i));
+        assert_eq!(resets, [3000, 6000, 9000, 12_000]);
+        assert!(!config.coarse(0) && steps(&|i| config.prunes(i)).is_empty());
+        assert_eq!(config.opacity_weight(1, 10, 1.0), 0.0);
+        assert_eq!(config.dropout(29_999, 3), 0.0);
+        let degrees = [999, 1000, 2000, 3000, 9000].map(|i| config.degree(i));
+        assert_eq!(degrees, [0, 1, 2, 3, 3]);
+        let rates = [0, 30_000].map(|i| config.rates(i, 1.0)[0]);
+        assert!((rates[0] - 1.6e-4).abs() < 1e-9 && (rates[1] - 1.6e-6).abs() < 1e-9);
+    }
 
     #[test]
     fn the_schedule_of_a_run() {
@@ -306,7 +372,7 @@ mod tests {
         assert!((first - 3.2e-4).abs() < 1e-8 && (last - first / 100.0).abs() < 1e-8);
         assert_eq!(
             [3599, 3600].map(|i| config.opacity_weight(i, 1, 0.5)),
-            [0.5 * MEAN_OPACITY_WEIGHT, 0.0]
+            [0.5 * config.mean_opacity_weight, 0.0]
         );
         let continued = TrainerConfig {
             first_degree: 2,

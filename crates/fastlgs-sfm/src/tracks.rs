@@ -33,8 +33,10 @@ pub fn overlapping_pairs(cameras: &[Camera], count: usize) -> Vec<(usize, usize)
         let cost = |b: &Camera| {
             a.centre().distance(b.centre()) / span + 2.0 * (1.0 - a.forward().dot(b.forward()))
         };
+        let overlaps =
+            |j: usize| count >= cameras.len() || a.forward().dot(cameras[j].forward()) > 0.3;
         let mut others: Vec<usize> = (0..cameras.len())
-            .filter(|&j| j != i && a.forward().dot(cameras[j].forward()) > 0.3)
+            .filter(|&j| j != i && overlaps(j))
             .collect();
         others.sort_by(|&x, &y| {
             cost(&cameras[x])

@@ -323,6 +323,11 @@ impl TextEncoder for ClipText {
         };
         Ok(embeddings.chunks_exact(TEMPLATES.len()).map(mean).collect())
     }
+
+    fn embed_alone(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>> {
+        let sentences: Vec<String> = texts.iter().map(|text| (*text).to_owned()).collect();
+        self.sentences(&sentences)
+    }
 }
 
 /// Checks that the embeddings of both towers have the same length.

@@ -108,6 +108,14 @@ pub enum Background {
 impl Background {
     /// All backgrounds.
     pub const ALL: [Self; 4] = [Self::Grey, Self::Black, Self::Blurred, Self::Context];
+    /// Names of all backgrounds, in the same order.
+    pub const NAMES: [&str; 4] = ["grey", "black", "blurred", "context"];
+
+    /// Returns the background of a name; `None` for an unknown one.
+    pub fn by_name(name: &str) -> Option<Self> {
+        let place = Self::NAMES.iter().position(|known| *known == name)?;
+        Some(Self::ALL[place])
+    }
 }
 
 /// Side in pixels to which a blurred background is reduced: it still shows the kind of place, but

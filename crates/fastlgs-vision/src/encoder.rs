@@ -24,6 +24,14 @@ pub trait TextEncoder: Send {
     /// When inference fails.
     fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>>;
 
+    /// As [`Self::embed`], but each text is embedded alone, without prompts around it (paper).
+    ///
+    /// # Errors
+    /// When inference fails.
+    fn embed_alone(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>> {
+        self.embed(texts)
+    }
+
     /// Returns by how much this text raises the cosine of unrelated masks, compared with other
     /// texts.
     fn baseline_shift(&self, _text: &str) -> f32 {

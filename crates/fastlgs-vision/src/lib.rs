@@ -19,6 +19,7 @@ pub mod masks;
 pub mod model_paths;
 pub mod models;
 pub mod names;
+pub mod provider;
 pub mod pull;
 #[cfg(test)]
 mod reference;
@@ -42,6 +43,7 @@ pub use clip::{ClipImage, ClipText};
 pub use conse::Conse;
 pub use encoder::{Encoder, TextEncoder};
 pub use import::Import;
+pub use provider::Provider;
 pub use sam::Sam;
 pub use segmenter::{OfflineSegmenter, Segmenter};
 pub use text::{MiniLm, OfflineText};

@@ -1,6 +1,7 @@
 //! Runs ONNX models. ONNX Runtime is loaded from a shared library, or linked in with the feature
 //! `download-ort`.
 
+use crate::provider::Provider;
 use crate::{Error, Result, model_paths};
 use half::f16;
 use ort::environment::Environment;
@@ -33,6 +34,11 @@ fn environment() -> Result<Environment> {
         .build()
         .map_err(|e| failed(&e))?;
     Ok(slot.insert(environment).clone())
+}
+
+/// Loads ONNX Runtime, if no model did so before.
+pub(crate) fn load_library() -> Result<()> {
+    environment().map(|_| ())
 }
 
 fn cores() -> usize {
@@ -80,6 +86,59 @@ pub struct Model {
     sessions: Vec<Mutex<Session>>,
 }
 
+/// Opens a session of a model on a provider.
+fn open(path: &Path, threads: usize, provider: Provider) -> Result<Session> {
+    let failed = |e: &dyn std::fmt::Display| Error::Inference {
+        model: path.display().to_string(),
+        reason: e.to_string(),
+    };
+    let mut builder = Session::builder(&environment()?)
+        .map_err(|e| failed(&e))?
+        .with_intra_threads(threads)
+        .map_err(|e| failed(&e))?;
+    if let Some(dispatch) = provider.dispatch() {
+        builder = builder
+            .with_execution_providers([dispatch])
+            .map_err(|e| failed(&e))?;
+    }
+    builder.commit_from_file(path).map_err(|e| failed(&e))
+}
+
+/// Opens the first session of a model on the chosen provider, and returns both. `Auto` becomes the
+/// first provider that works.
+fn first_session(path: &Path, threads: usize) -> Result<(Provider, Session)> {
+    load_library()?;
+    let chosen = Provider::chosen();
+    if chosen == Provider::Auto {
+        let built_in = Provider::AUTOMATIC.into_iter().filter(|p| p.is_built_in());
+        for provider in built_in {
+            match open(path, threads, provider) {
+                Ok(session) => return Ok((provider, session)),
+                Err(error) => tracing::info!("{} is not used: {error}", provider.name()),
+            }
+        }
+        return Ok((Provider::Cpu, open(path, threads, Provider::Cpu)?));
+    }
+    if !chosen.is_built_in() {
+        let library = model_paths::runtime_library()?;
+        return Err(chosen.unavailable(&library, "the library was built without it"));
+    }
+    match open(path, threads, chosen) {
+        Ok(session) => Ok((chosen, session)),
+        // A model that the processor cannot open either is the reason.
+        Err(error) if chosen == Provider::Cpu || open(path, threads, Provider::Cpu).is_err() => {
+            Err(error)
+        }
+        Err(error) => {
+            let reason = match error {
+                Error::Inference { reason, .. } => reason,
+                other => other.to_string(),
+            };
+            Err(chosen.unavailable(&model_paths::runtime_library()?, &reason))
+        }
+    }
+}
+
 impl Model {
     /// Loads an ONNX file; each run uses as many threads as the machine has cores.
     ///
@@ -110,15 +169,13 @@ impl Model {
             model: name.clone(),
             reason: e.to_string(),
         };
-        let environment = environment()?;
-        let open = || -> Result<Session> {
-            let mut builder = Session::builder(&environment)
-                .map_err(|e| failed(&e))?
-                .with_intra_threads(threads)
-                .map_err(|e| failed(&e))?;
-            builder.commit_from_file(path).map_err(|e| failed(&e))
-        };
-        let sessions = (0..count).map(|_| open()).collect::<Result<Vec<_>>>()?;
+        let (provider, first) = first_session(path, threads)?;
+        provider.record();
+        let mut sessions = vec![first];
+        // A graphics card runs one model at a time.
+        while provider == Provider::Cpu && sessions.len() < count {
+            sessions.push(open(path, threads, provider)?);
+        }
         let session = &sessions[0];
         let slot = |outlet: &ort::value::Outlet| match outlet.dtype() {
             ValueType::Tensor { ty, shape, .. } => {

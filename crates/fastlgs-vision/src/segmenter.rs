@@ -19,6 +19,20 @@ pub trait Segmenter: Sync {
     /// # Errors
     /// Failed inference, or imported masks that are missing.
     fn segment(&self, view: &str, photo: &RgbImage) -> Result<MaskList>;
+
+    /// Returns whether photos are segmented in parallel. A segmenter that uses all cores itself
+    /// takes one photo after another, so that an interruption costs one photo.
+    fn is_parallel(&self) -> bool {
+        true
+    }
+
+    /// Measures and returns the seconds for a photo; `None` if it takes only moments.
+    ///
+    /// # Errors
+    /// As [`Self::segment`].
+    fn seconds_per_photo(&self, _photo: &RgbImage) -> Result<Option<f64>> {
+        Ok(None)
+    }
 }
 
 /// Offline segmenter: builds a region hierarchy from learned edges (HED), colour and the

@@ -58,12 +58,7 @@ impl Cache {
         inputs: &Key,
         make: impl FnOnce() -> Result<T>,
     ) -> Result<T> {
-        let key = key(&[env!("CARGO_PKG_VERSION").as_bytes(), inputs]);
-        let name: String = key[..NAME_LENGTH / 2]
-            .iter()
-            .map(|b| format!("{b:02x}"))
-            .collect();
-        let path = self.root.join(stage).join(name);
+        let path = self.path(stage, inputs);
         // An unreadable file counts as missing.
         let cached = std::fs::read(&path)
             .ok()
@@ -84,6 +79,20 @@ impl Cache {
         let bytes = postcard::to_stdvec(&made)?;
         fs::write_atomic(&path, |file| std::io::Write::write_all(file, &bytes))?;
         Ok(made)
+    }
+
+    /// Returns whether there is a result of these inputs and this version of the program.
+    pub fn has(&self, stage: &str, inputs: &Key) -> bool {
+        self.path(stage, inputs).is_file()
+    }
+
+    fn path(&self, stage: &str, inputs: &Key) -> PathBuf {
+        let key = key(&[env!("CARGO_PKG_VERSION").as_bytes(), inputs]);
+        let name: String = key[..NAME_LENGTH / 2]
+            .iter()
+            .map(|b| format!("{b:02x}"))
+            .collect();
+        self.root.join(stage).join(name)
     }
 
     /// Returns by stage the number of results found, and the number of results requested.

@@ -58,7 +58,15 @@ fn read_calibration(files: &BTreeMap<String, ModelFile>) -> Option<CalibrationFi
             path.display()
         );
     }
-    kept.ok().filter(|kept| kept.sha256 == tower_hashes(files))
+    let kept = kept.ok()?;
+    if kept.sha256 == tower_hashes(files) {
+        return Some(kept);
+    }
+    tracing::warn!(
+        "{}: this calibration was measured with other files of image or text tower, so it is ignored; run 'fastlgs models calibrate' again",
+        path.display()
+    );
+    None
 }
 
 /// Returns the background around masks in the crops of a scene.

@@ -9,6 +9,7 @@ use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::{self, QueryConfig};
+use fastlgs_grid::relevancy::Rule;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -146,6 +147,8 @@ impl Search {
             &SceneFolder::new(root.join(first)),
             manifest,
             config.clip_text.as_deref(),
+            // Scores of different scenes are comparable only if they are calibrated.
+            Rule::Calibrated,
         )?;
         let search = Self {
             config,

@@ -1,12 +1,13 @@
 //! Runs preprocessing and training, and skips finished work.
 
 use crate::error::Context;
-use crate::model_choice::SamPreset;
+use crate::model_choice::{EncoderKind, SamPreset};
 use crate::output::{SceneLock, check_apart};
 use crate::preprocess::fingerprint;
 use crate::{Result, Run, SceneNotes, checkpoints, preprocess, train};
 use fastlgs_core::SceneFolder;
 use fastlgs_vision::conse;
+use fastlgs_vision::crops::Background;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -64,13 +65,10 @@ pub fn make(config: &MakeConfig, run: &Run) -> Result<MakeReport> {
         preset: config.effort,
         ..Default::default()
     };
-    let mut preprocess = config.preprocess.clone();
-    if config.effort == train::Preset::LikePaper {
-        preprocess
-            .eyes
-            .sam_preset
-            .get_or_insert(SamPreset::LangSplat);
-    }
+    let preprocess = match config.effort {
+        train::Preset::LikePaper => like_paper(config.preprocess.clone()),
+        _ => config.preprocess.clone(),
+    };
     let (state, train) = make_scene(&preprocess, &train, [run, run])?;
     let folder = SceneFolder::open(&config.preprocess.output)?;
     let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
@@ -82,6 +80,17 @@ pub fn make(config: &MakeConfig, run: &Run) -> Result<MakeReport> {
         ],
         train,
     })
+}
+
+/// Returns the options of `preprocess` that the paper implies: LangSplat's masks, crops on black, and
+/// key points of each photo matched with those of all others.
+fn like_paper(mut config: preprocess::PreprocessConfig) -> preprocess::PreprocessConfig {
+    config.eyes.sam_preset.get_or_insert(SamPreset::LangSplat);
+    if config.eyes.encoder == EncoderKind::Clip {
+        config.eyes.crops.get_or_insert(Background::Black);
+    }
+    config.neighbours = usize::MAX;
+    config
 }
 
 /// Makes a scene with all options of both stages. `runs` holds the run of `preprocess` and that of
@@ -200,6 +209,18 @@ fn fingerprints(folder: &Path) -> Result<Value> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn like_paper_implies_its_masks_crops_and_matches() {
+        let mut config = preprocess::PreprocessConfig::default();
+        config.eyes.encoder = EncoderKind::Clip;
+        let resolved = like_paper(config.clone());
+        assert_eq!(resolved.eyes.sam_preset, Some(SamPreset::LangSplat));
+        assert_eq!(resolved.eyes.crops, Some(Background::Black));
+        assert_eq!(resolved.neighbours, usize::MAX);
+        config.eyes.crops = Some(Background::Grey);
+        assert_eq!(like_paper(config).eyes.crops, Some(Background::Grey));
+    }
 
     #[test]
     fn changed_photos_change_the_fingerprint() {

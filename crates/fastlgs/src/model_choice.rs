@@ -6,6 +6,7 @@ use fastlgs_core::scene_folder::{Manifest, ModelFile};
 use fastlgs_core::{Camera, LabelMap, Level, MaskList, SceneFolder};
 use fastlgs_grid::mapping::Mask;
 use fastlgs_grid::{Grid, evidence};
+use fastlgs_vision::crops::Background;
 use fastlgs_vision::import::{self, Import, Lens};
 use fastlgs_vision::pull::ModelPair;
 use fastlgs_vision::sam::{self, Sam};
@@ -144,6 +145,19 @@ pub struct ModelChoice {
     /// belongs to them.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
     pub clip_text: Option<PathBuf>,
+    /// Pixels around a mask in its crop for CLIP: grey, black, the blurred photo, or the photo
+    /// itself with a margin. Default: the best one by `models calibrate`, else grey; black with
+    /// `make --effort like-paper`.
+    #[cfg_attr(feature = "clap", arg(long, value_parser = background_parser()))]
+    pub crops: Option<Background>,
+}
+
+/// Parses the name of a background.
+#[cfg(feature = "clap")]
+fn background_parser() -> impl clap::builder::TypedValueParser<Value = Background> {
+    use clap::builder::{PossibleValuesParser, TypedValueParser};
+    PossibleValuesParser::new(Background::NAMES)
+        .map(|name| Background::by_name(&name).unwrap_or_default())
 }
 
 impl Default for ModelChoice {
@@ -162,6 +176,7 @@ impl Default for ModelChoice {
             clip: "clip-vit-b16".to_owned(),
             clip_image: None,
             clip_text: None,
+            crops: None,
         }
     }
 }
@@ -188,6 +203,9 @@ impl ModelChoice {
         let for_clip = "this is for CLIP; set encoder to clip";
         if self.encoder != EncoderKind::Clip && self.clip_image.is_some() {
             return Err(Error::option("clip_image", for_clip));
+        }
+        if self.encoder != EncoderKind::Clip && self.crops.is_some() {
+            return Err(Error::option("crops", for_clip));
         }
         if self.encoder == EncoderKind::Offline && self.clip_text.is_some() {
             return Err(Error::option("clip_text", for_clip));
@@ -260,11 +278,17 @@ impl ModelChoice {
         Ok(match self.encoder {
             EncoderKind::Clip => Box::new(
                 self.clip_image()?
-                    .with_background(calibrations::best_background(&self.files()?)),
+                    .with_background(self.background(&self.files()?)),
             ),
             EncoderKind::Import => Box::new(Import::open(photos, lenses.clone())?),
             EncoderKind::Offline => Box::new(Conse::load()?),
         })
+    }
+
+    /// Returns the background around masks in crops. `files` are the model files.
+    pub(crate) fn background(&self, files: &BTreeMap<String, ModelFile>) -> Background {
+        self.crops
+            .unwrap_or_else(|| calibrations::best_background(files))
     }
 
     /// Loads CLIP's image tower, after checking that the text tower belongs to it. Otherwise a
@@ -470,6 +494,28 @@ pub fn encoder_of(folder: &SceneFolder, manifest: &Manifest) -> Result<Box<dyn E
     })
 }
 
+/// Checks that a text tower has the content of the one that the manifest records, if it records one.
+///
+/// # Errors
+/// Another content. Its embeddings may have the same length, but mean something else.
+fn check_text_tower(manifest: &Manifest, path: &Path) -> Result<()> {
+    let Some(recorded) = manifest.models.get("clip_text") else {
+        return Ok(());
+    };
+    if model_paths::digest(path)?.1 != recorded.sha256 {
+        return Err(Error::option(
+            "clip_text",
+            format!(
+                "{} is not the text tower that belongs to the embeddings of the scene, which was {}; name a copy of that \
+                 file, or run 'fastlgs preprocess' again with the new tower",
+                path.display(),
+                recorded.path.display()
+            ),
+        ));
+    }
+    Ok(())
+}
+
 /// Loads the text tower of the encoder that made a scene's embeddings. `clip_text` replaces the
 /// CLIP tower that the manifest names.
 pub fn text_encoder_of(
@@ -478,7 +524,10 @@ pub fn text_encoder_of(
 ) -> Result<Box<dyn TextEncoder>> {
     Ok(match (manifest.encoder.as_str(), clip_text) {
         ("offline", _) => Box::new(OfflineText::load()?),
-        (_, Some(path)) => Box::new(ClipText::load(path)?),
+        (_, Some(path)) => {
+            check_text_tower(manifest, path)?;
+            Box::new(ClipText::load(path)?)
+        }
         ("clip", None) => Box::new(ClipText::load(recorded_model(manifest, "clip_text")?)?),
         ("import", None) if manifest.models.contains_key("clip_text") => {
             Box::new(ClipText::load(recorded_model(manifest, "clip_text")?)?)

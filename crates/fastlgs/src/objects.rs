@@ -1,7 +1,7 @@
 //! Finds objects from masks for `train`, by global mapping, or loads the objects of an earlier run.
 
 use crate::error::{Context, bail};
-use crate::{Result, Run, masks, model_choice};
+use crate::{Result, Run, embedding_views, masks, model_choice};
 use fastlgs_core::mask_list::{AtomTable, Atoms};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder, fs};
 use fastlgs_grid::mapping::Mask;
@@ -26,9 +26,6 @@ pub struct MappingConfig {
     /// Whether the scene was trained with the 2-D Mip filter, which changes blending weights.
     pub antialias: bool,
 }
-
-/// Number of views in which an object is embedded: those that show most of it.
-const EMBEDDED_VIEWS: usize = 3;
 
 /// Returns the path of a marker file. It exists while the object maps do not belong to the saved
 /// object table.
@@ -283,13 +280,13 @@ pub fn embed_objects(
     run: &Run,
 ) -> Result<(Grid, Summary)> {
     let lists = chosen.lists();
-    let areas: Vec<&[(u32, u32)]> = chosen.support.iter().map(|s| s.areas.as_slice()).collect();
+    let embedding_views = embedding_views(scene, training, &chosen);
     let (found, object_of) = embed(
         folder,
         training,
         &chosen.layers(),
         &lists,
-        &best_views(&areas),
+        &embedding_views,
         run,
     )?;
     let mut grid = Grid::build(
@@ -302,7 +299,7 @@ pub fn embed_objects(
         .iter_mut()
         .zip(chosen.parents.iter().zip(&chosen.support))
     {
-        (object.parent, object.support, object.views) = (*parent, support.iou, support.areas.len());
+        (object.parent, object.support, object.views) = (*parent, support.iou, support.views.len());
     }
     (grid.overlaps, grid.id_areas, grid.encoder) = (
         chosen.overlaps,
@@ -401,19 +398,19 @@ pub fn atoms(folder: &SceneFolder, camera: &Camera) -> Result<Atoms> {
     Ok(folder.masks(camera)?.atoms().without_gaps())
 }
 
-/// Returns for each object the views that show most of it, best first. `areas` holds the area and
-/// the view.
-fn best_views(areas: &[&[(u32, u32)]]) -> Vec<Vec<usize>> {
-    let best = |areas: &&[(u32, u32)]| {
-        let mut areas = areas.to_vec();
-        areas.sort_by_key(|&(area, view)| (std::cmp::Reverse(area), view));
-        areas
-            .into_iter()
-            .take(EMBEDDED_VIEWS)
-            .map(|a| a.1 as usize)
-            .collect()
-    };
-    areas.iter().map(best).collect()
+/// Returns for each object the views in which it is embedded.
+fn embedding_views(scene: &Gaussians, training: &[Camera], chosen: &Chosen) -> Vec<Vec<usize>> {
+    let lists = chosen.lists();
+    let mut own: Vec<Vec<usize>> = vec![Vec::new(); chosen.support.len()];
+    for (i, id) in scene.object_ids.iter().enumerate() {
+        for object in &lists[usize::from(*id)] {
+            own[usize::from(*object) - 1].push(i);
+        }
+    }
+    let objects = chosen.support.par_iter().zip(own);
+    objects
+        .map(|(support, own)| embedding_views::choose(&support.views, &own, scene, training))
+        .collect()
 }
 
 #[cfg(test)]
@@ -518,11 +515,5 @@ mod tests {
         let pairs = scene.object_ids.iter().zip(&ids);
         let same = pairs.filter(|(a, b)| a == b).count();
         assert!(10 * same > 9 * ids.len(), "{same} of {}", ids.len());
-    }
-
-    #[test]
-    fn the_views_with_the_largest_areas_are_embedded() {
-        let areas = [(5, 0), (9, 3), (9, 1), (1, 2)];
-        assert_eq!(best_views(&[&areas]), [[1, 3, 0]]);
     }
 }

@@ -37,6 +37,11 @@ impl<'a> Run<'a> {
         }
     }
 
+    /// Sends a note to the progress sink.
+    pub fn note(&self, text: &str) {
+        self.progress.on_message(Message::Note(text));
+    }
+
     /// Sends a warning to the progress sink.
     pub fn warn(&self, text: &str) {
         self.progress.on_message(Message::Warning(text));
@@ -102,6 +107,8 @@ pub enum Message<'a> {
         /// Name of the stage.
         stage: &'static str,
     },
+    /// A note, such as how long a stage takes.
+    Note(&'a str),
     /// A warning: the stage continues.
     Warning(&'a str),
 }

@@ -335,7 +335,8 @@ impl Scene {
     /// Returns the text encoder of the scene; the first call loads it.
     pub(crate) fn texts(&self) -> Result<&Texts> {
         if self.texts.get().is_none() {
-            let texts = Texts::load(&self.folder, &self.manifest, self.clip_text.as_deref())?;
+            let file = self.clip_text.as_deref();
+            let texts = Texts::load(&self.folder, &self.manifest, file, self.rule())?;
             let _ = self.texts.set(self.configure_texts(texts));
         }
         Ok(self.texts.get().expect("set above"))
@@ -345,7 +346,6 @@ impl Scene {
     /// are not used.
     fn configure_texts(&self, mut texts: Texts) -> Texts {
         texts.calibrations = self.calibrations.unwrap_or(texts.calibrations);
-        texts.rule = self.rule();
         if !self.use_taught_names {
             texts.ignore_taught_names();
         }
@@ -387,7 +387,7 @@ impl Scene {
     /// # Errors
     /// An encoder whose embeddings have another length than those of the scene.
     pub fn use_text_encoder(&mut self, encoder: Box<dyn TextEncoder>) -> Result<()> {
-        let texts = Texts::from_encoder(encoder, &self.folder, &self.manifest)?;
+        let texts = Texts::from_encoder(encoder, &self.folder, &self.manifest, self.rule())?;
         self.texts = OnceCell::from(self.configure_texts(texts));
         Ok(())
     }

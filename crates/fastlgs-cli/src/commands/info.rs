@@ -5,7 +5,7 @@ use crate::{report, ui, words};
 use anyhow::Result;
 use fastlgs_core::SceneFolder;
 use fastlgs_sfm::keypoints;
-use fastlgs_vision::models;
+use fastlgs_vision::{Provider, model_paths, models, provider};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -32,6 +32,10 @@ fn machine(common: &ui::Common) -> Result<Outcome> {
     );
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let (sift, installed) = (keypoints::backend(), models::offline_installed());
+    // Without ONNX Runtime there are none.
+    let providers = provider::built_in().unwrap_or_default();
+    let providers: Vec<&str> = providers.into_iter().map(Provider::name).collect();
+    let runtime = model_paths::runtime_library().ok();
     let value = json!({
         "version": version,
         "adapters": adapters,
@@ -39,6 +43,8 @@ fn machine(common: &ui::Common) -> Result<Outcome> {
         "cores": cores,
         "sift": sift,
         "offline_models": installed,
+        "onnx_runtime": runtime,
+        "onnx_providers": providers,
     });
     report::write_summary(common, &value, |_| {
         words::table(&[
@@ -53,6 +59,15 @@ fn machine(common: &ui::Common) -> Result<Outcome> {
                 },
             ),
             ("auto device", format!("{} ({})", auto.device, auto.why)),
+            (
+                "models run on",
+                if providers.is_empty() {
+                    "nothing; ONNX Runtime is missing: run fastlgs models install-offline"
+                        .to_owned()
+                } else {
+                    format!("{} (--onnx)", providers.join(", "))
+                },
+            ),
             (
                 "encoders",
                 if installed {

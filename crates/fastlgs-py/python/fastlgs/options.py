@@ -19,6 +19,11 @@ class PreprocessOptions(TypedDict, total=False):
     # that belongs to them
     clip_text: Path
 
+    # Pixels around a mask in its crop for CLIP: grey, black, the blurred photo, or the photo
+    # itself with a margin. Default: the best one by `models calibrate`, else grey; black with
+    # `make --effort like-paper`
+    crops: Literal["grey", "black", "blurred", "context"]
+
     # Encoder, which embeds masks
     encoder: Literal["offline", "clip", "import"]
 

@@ -1,7 +1,7 @@
 //! Automatic mask generation: a grid of point prompts over the photo and its crops, filters, and
 //! non-maximum suppression.
 
-use super::exports::{Exports, Logits};
+use super::exports::{Encoded, Exports, Logits};
 use super::windows::Grid;
 use super::{SamConfig, Suppression};
 use crate::Result;
@@ -9,6 +9,7 @@ use crate::masks::{BitMask, box_iou};
 use fastlgs_core::Level;
 use image::{RgbImage, imageops};
 use std::collections::HashSet;
+use std::time::Instant;
 
 /// Largest number of prompts in one inference.
 const BATCH: usize = 64;
@@ -92,6 +93,36 @@ pub fn masks(
     Ok((all, single))
 }
 
+/// Returns the seconds that the masks of a photo take, from one image and one batch of prompts. The
+/// filters after inference are left out.
+pub fn seconds(exports: &Exports, photo: &RgbImage, config: &SamConfig) -> Result<f64> {
+    // The first runs of a model are slower than the others.
+    exports.encode(photo)?;
+    let began = Instant::now();
+    let encoded = exports.encode(photo)?;
+    let encoding = began.elapsed().as_secs_f64();
+    let batch = batch_size(exports, &encoded);
+    let points = vec![[0.5; 2]; batch];
+    let mut decoding = f64::INFINITY;
+    for _ in 0..3 {
+        let began = Instant::now();
+        exports.decode(&encoded, &points)?;
+        decoding = decoding.min(began.elapsed().as_secs_f64());
+    }
+    let prompts = config.points_per_side.pow(2) as usize;
+    let images = (0..=config.crop_layers)
+        .map(|layer| 1u32 << (2 * layer))
+        .sum::<u32>();
+    let batches = prompts.div_ceil(batch) as f64;
+    Ok(f64::from(images) * (encoding + batches * decoding))
+}
+
+/// Returns the number of prompts in one inference.
+fn batch_size(exports: &Exports, encoded: &Encoded) -> usize {
+    let most = || exports.most_prompts(encoded).min(BATCH);
+    exports.fixed_batch().unwrap_or_else(most)
+}
+
 fn masks_of_crop(
     exports: &Exports,
     photo: &RgbImage,
@@ -107,11 +138,10 @@ fn masks_of_crop(
     let grid: Vec<[f32; 2]> = (0..n)
         .flat_map(|y| (0..n).map(move |x| [at(x), at(y)]))
         .collect();
-    let batch = exports.fixed_batch();
     let mut found: Vec<Candidate> = Vec::new();
-    for points in grid.chunks(batch.unwrap_or_else(|| exports.most_prompts(&encoded).min(BATCH))) {
+    for points in grid.chunks(batch_size(exports, &encoded)) {
         let mut asked = points.to_vec();
-        asked.resize(batch.unwrap_or(points.len()), points[0]);
+        asked.resize(exports.fixed_batch().unwrap_or(points.len()), points[0]);
         let logits = exports.decode(&encoded, &asked)?;
         for prompt in 0..points.len() {
             let mut own = masks_of_prompt(&logits, prompt, [width, height], config);

@@ -181,6 +181,14 @@ impl Segmenter for Sam {
             masks: levels.into_iter().flatten().map(with_level).collect(),
         })
     }
+
+    fn is_parallel(&self) -> bool {
+        false
+    }
+
+    fn seconds_per_photo(&self, photo: &RgbImage) -> Result<Option<f64>> {
+        generation::seconds(&self.exports, photo, &self.config).map(Some)
+    }
 }
 
 #[cfg(test)]
@@ -292,6 +300,27 @@ mod tests {
                 "{export:?}: the subpart level must not repeat a whole"
             );
         }
+    }
+
+    #[test]
+    fn seconds_are_estimated_before_photos_are_segmented_one_by_one() {
+        let config = SamConfig {
+            points_per_side: 16,
+            ..SamConfig::default()
+        };
+        let Some((_dir, sam)) = sam(SamExport::Transformers, config) else {
+            return;
+        };
+        assert!(!sam.is_parallel());
+        let seconds = sam.seconds_per_photo(&photo()).unwrap().unwrap();
+        let began = std::time::Instant::now();
+        sam.segment("", &photo()).unwrap();
+        let needed = began.elapsed().as_secs_f64();
+        // Other tests run beside this one.
+        assert!(
+            seconds > needed / 20.0 && seconds < 20.0 * needed,
+            "estimated {seconds} s, needed {needed} s"
+        );
     }
 
     #[test]

@@ -154,6 +154,8 @@ pub struct PreprocessReport {
     pub points: usize,
     /// SIFT implementation that detected the key points.
     pub sift: String,
+    /// Hardware that ran the models, as in `--onnx`. None if no model was needed.
+    pub onnx: Option<String>,
     /// Number of cameras that were moved because their poses contradicted the photos.
     pub moved_cameras: usize,
     /// Result of bundle adjustment, if it ran.

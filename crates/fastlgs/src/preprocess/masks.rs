@@ -35,10 +35,7 @@ pub(super) fn segment(
                 .with_context(|| format!("segmenting {name}"))
         };
         let list = match &identity {
-            Some(identity) => {
-                let key = cache::key(&[b"list", &photo.key, identity.as_bytes()]);
-                cache.get("masks", &key, make)?
-            }
+            Some(identity) => cache.get("masks", &mask_key(photo, identity), make)?,
             None => make()?,
         };
         let list = kept_masks(config, photo, list);
@@ -46,7 +43,23 @@ pub(super) fn segment(
         work.advance()?;
         Ok(Level::ALL.map(|level| list.count(level)))
     };
-    let counts: Vec<[usize; 3]> = training.par_iter().map(of_photo).collect::<Result<_>>()?;
+    let is_known = |photo: &&PreparedPhoto| {
+        identity
+            .as_ref()
+            .is_some_and(|identity| cache.has("masks", &mask_key(photo, identity)))
+    };
+    let missing = training.len() - training.iter().filter(is_known).count();
+    if missing > 0 {
+        let first = folder.photo(&training[0].camera.name)?;
+        if let Some(seconds) = segmenter.seconds_per_photo(&first)? {
+            run.note(&estimate(seconds, missing));
+        }
+    }
+    let counts: Vec<[usize; 3]> = if segmenter.is_parallel() {
+        training.par_iter().map(of_photo).collect::<Result<_>>()?
+    } else {
+        training.iter().map(of_photo).collect::<Result<_>>()?
+    };
     if counts.iter().flatten().all(|count| *count == 0) {
         bail!(
             "{}: no mask was found in any training photo; check the segmenter or the imported masks",
@@ -76,6 +89,25 @@ pub(super) fn segment(
     Ok((counts.iter().flatten().sum(), means))
 }
 
+/// Returns the cache key of the masks of a photo.
+fn mask_key(photo: &PreparedPhoto, segmenter: &str) -> cache::Key {
+    cache::key(&[b"list", &photo.key, segmenter.as_bytes()])
+}
+
+/// Returns a sentence with the time that segmenting some photos takes.
+fn estimate(seconds_per_photo: f64, photos: usize) -> String {
+    let minutes = seconds_per_photo * photos as f64 / 60.0;
+    let time = match minutes {
+        0.0..1.5 => "about a minute".to_owned(),
+        1.5..100.0 => format!("about {minutes:.0} minutes"),
+        _ => format!("about {:.1} hours", minutes / 60.0),
+    };
+    format!(
+        "masks: {photos} photos at {seconds_per_photo:.0} s each take {time}; the masks of each photo are kept, so an \
+         interrupted run continues"
+    )
+}
+
 /// Returns the masks of a photo that are kept, in the pixels of the prepared photo.
 fn kept_masks(config: &PreprocessConfig, photo: &PreparedPhoto, mut list: MaskList) -> MaskList {
     if photo.removed_k1 != 0.0 && config.eyes.segmenter == SegmenterKind::Import {
@@ -89,4 +121,16 @@ fn kept_masks(config: &PreprocessConfig, photo: &PreparedPhoto, mut list: MaskLi
     list.masks
         .retain(|mask| config.eyes.keeps(mask.level) && mask.runs.area() > 0);
     list
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn estimates_have_a_readable_unit() {
+        assert!(estimate(0.4, 20).contains("about a minute"));
+        assert!(estimate(38.0, 43).contains("43 photos at 38 s each take about 27 minutes"));
+        assert!(estimate(190.0, 84).contains("about 4.4 hours"));
+    }
 }

@@ -24,7 +24,7 @@ use fastlgs_sfm::pose_check::PoseCheckReport;
 use fastlgs_sfm::tracks::PairMatches;
 use fastlgs_sfm::video::is_video;
 use fastlgs_sfm::{brightness, sweep, tracks};
-use fastlgs_vision::{Encoder, Segmenter, import};
+use fastlgs_vision::{Encoder, Provider, Segmenter, import};
 use photos::PreparedPhoto;
 pub use photos::{Photo, load_photo};
 use std::collections::{BTreeMap, BTreeSet};
@@ -260,6 +260,7 @@ impl Stage<'_> {
             key_point_matches: found.key_point_matches,
             points: found.points,
             sift: keypoints::backend().to_owned(),
+            onnx: Provider::used().map(|provider| provider.name().to_owned()),
             moved_cameras: placed.checked.moved.len(),
             adjusted: placed.adjusted,
             warnings: self.warnings,
@@ -349,7 +350,7 @@ impl Stage<'_> {
             held_out_views,
             segmenter: self.config.eyes.segmenter.name().to_owned(),
             encoder: self.config.eyes.encoder.name().to_owned(),
-            crops: calibrations::background_name(calibrations::best_background(&models.files)),
+            crops: calibrations::background_name(self.config.eyes.background(&models.files)),
             models: models.files.clone(),
             seed: self.run.seed,
             warnings: Vec::new(),

@@ -43,6 +43,14 @@ pub(super) fn check_embeddings(
     Ok(())
 }
 
+/// Embeds texts: each alone by the paper's rule, otherwise in several prompts.
+fn embed_by(rule: Rule, encoder: &dyn TextEncoder, texts: &[&str]) -> Result<Vec<Vec<f32>>> {
+    Ok(match rule {
+        Rule::Paper => encoder.embed_alone(texts)?,
+        Rule::Calibrated => encoder.embed(texts)?,
+    })
+}
+
 /// Returns a hash of texts and of their encoder, which `embeddings` of it identify.
 fn fingerprint(embeddings: &[f32], texts: &str) -> u64 {
     let values = embeddings.iter().flat_map(|v| v.to_bits().to_le_bytes());
@@ -60,7 +68,7 @@ pub struct Texts {
     /// Calibrations of the encoder.
     pub calibrations: Calibrations,
     /// How text queries rank and accept objects.
-    pub rule: Rule,
+    rule: Rule,
     names: Names,
     identity: String,
 }
@@ -72,11 +80,13 @@ impl Texts {
         folder: &SceneFolder,
         manifest: &Manifest,
         clip_text: Option<&Path>,
+        rule: Rule,
     ) -> Result<Self> {
         Self::from_encoder(
             model_choice::text_encoder_of(manifest, clip_text)?,
             folder,
             manifest,
+            rule,
         )
     }
 
@@ -89,13 +99,15 @@ impl Texts {
         encoder: Box<dyn TextEncoder>,
         folder: &SceneFolder,
         manifest: &Manifest,
+        rule: Rule,
     ) -> Result<Self> {
+        let canonical = embed_by(rule, &*encoder, &CANONICAL)?;
+        let length = canonical[0].len();
         let canonical = if manifest.encoder == calibrations::OFFLINE {
             Vec::new()
         } else {
-            encoder.embed(&CANONICAL)?
+            canonical
         };
-        let length = encoder.embed(&CANONICAL[..1])?[0].len();
         let grid = Grid::load(folder)
             .context("the object grid cannot be read; run 'fastlgs train' again")?;
         check_embeddings(manifest, &grid, folder, "texts", length)?;
@@ -107,10 +119,14 @@ impl Texts {
             encoder,
             canonical,
             calibrations,
-            rule: Rule::default(),
+            rule,
             names: Names::load()?,
             identity,
         })
+    }
+
+    fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>> {
+        embed_by(self.rule, &*self.encoder, texts)
     }
 
     /// Ignores taught names from now on.
@@ -147,7 +163,7 @@ impl Texts {
                 )
             });
         }
-        Ok(self.embedded_query(text, self.encoder.embed(&[text])?.remove(0)))
+        Ok(self.embedded_query(text, self.embed(&[text])?.remove(0)))
     }
 
     /// Returns the queries of many texts. A name that was taught only with another encoder is
@@ -164,9 +180,7 @@ impl Texts {
             }
         };
         let texts: Vec<String> = texts.iter().map(plain).collect();
-        let embeddings = self
-            .encoder
-            .embed(&texts.iter().map(String::as_str).collect::<Vec<_>>())?;
+        let embeddings = self.embed(&texts.iter().map(String::as_str).collect::<Vec<_>>())?;
         let query = |(text, embedding): (&String, Vec<f32>)| {
             self.example_query(text)
                 .unwrap_or_else(|| self.embedded_query(text, embedding))
@@ -219,7 +233,7 @@ impl Texts {
         {
             return Ok(values.chunks_exact(shape[1]).map(<[f32]>::to_vec).collect());
         }
-        let embeddings = self.encoder.embed(&EVERYDAY)?;
+        let embeddings = self.embed(&EVERYDAY)?;
         let shape = vec![EVERYDAY.len(), embeddings[0].len()];
         if let Err(e) = save_tensors(&path, &[("names", shape, &embeddings.concat())]) {
             tracing::debug!("the embeddings of everyday names cannot be saved: {e}");

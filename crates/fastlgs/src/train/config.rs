@@ -20,8 +20,9 @@ pub enum Preset {
     Standard,
     /// 30,000 iterations.
     Paper,
-    /// 30,000 iterations, and everything else as in the paper: Algorithm 1 finds the objects, and
-    /// codes are trained together with the scene.
+    /// 30,000 iterations, and everything else as in the paper: the schedule of 3DGS, Algorithm 1
+    /// finds the objects, codes are trained together with the scene, and the largest relevancy
+    /// answers a text.
     LikePaper,
 }
 
@@ -297,13 +298,30 @@ impl Default for TrainConfig {
     }
 }
 
+/// Returns `Off` for `Auto`.
+fn off_if_auto(switch: Switch) -> Switch {
+    match switch {
+        Switch::Auto => Switch::Off,
+        chosen => chosen,
+    }
+}
+
 impl TrainConfig {
+    /// Returns whether few photos get a treatment of their own: a backdrop, and removal of floaters
+    /// from empty space. The paper has none.
+    pub(super) fn treats_few_views(&self) -> bool {
+        self.preset != Preset::LikePaper
+    }
+
     /// Returns the options with those that the preset implies.
     pub(super) fn resolved(&self) -> Self {
         match self.preset {
             Preset::LikePaper => Self {
                 mapping: Mapping::Paper,
                 feature_mode: FeatureMode::Train,
+                exposure: off_if_auto(self.exposure),
+                align: off_if_auto(self.align),
+                budget: Some(self.budget.unwrap_or(self.preset.values().2)),
                 ..self.clone()
             },
             _ => self.clone(),
@@ -318,7 +336,7 @@ impl TrainConfig {
     /// Returns the default of the highest SH degree for a number of training views.
     pub(super) fn degree(&self, views: usize) -> u32 {
         let (_, degree, _) = self.preset.values();
-        if views < FEW_VIEWS && self.preset != Preset::LikePaper {
+        if views < FEW_VIEWS && self.treats_few_views() {
             degree.min(FEW_VIEWS_SH_DEGREE)
         } else {
             degree
@@ -386,6 +404,20 @@ mod tests {
         let resolved = config.resolved();
         assert_eq!(resolved.mapping, Mapping::Paper);
         assert_eq!(resolved.feature_mode, FeatureMode::Train);
+        // The list of what like-paper sets is in docs/like-paper.md.
+        assert_eq!(
+            (resolved.exposure, resolved.align),
+            (Switch::Off, Switch::Off)
+        );
+        assert_eq!(resolved.budget(usize::MAX), Budget::Fixed(1_000_000));
+        assert_eq!(resolved.iterations(), 30_000);
+        assert_eq!(resolved.degree(3), 3);
+        assert!(!resolved.treats_few_views() && !resolved.masks_guide_training("sam"));
+        let algorithm = resolved.paper("clip");
+        assert_eq!(
+            (algorithm.tau, algorithm.theta, algorithm.alpha),
+            (4, 0.95, 0.3)
+        );
         assert_eq!(TrainConfig::default().resolved().mapping, Mapping::Global);
     }
 

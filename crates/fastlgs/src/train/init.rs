@@ -51,7 +51,7 @@ pub fn gaussians(
         .cameras
         .iter()
         .any(|camera| folder.alpha_path(&camera.name).is_file());
-    let backdrop = if views.len() < FEW_VIEWS && !cut_out {
+    let backdrop = if views.len() < FEW_VIEWS && config.treats_few_views() && !cut_out {
         init::backdrop(views, &points, most / 2)?
     } else {
         Gaussians::default()
@@ -164,7 +164,8 @@ pub fn free_space(
     cameras: &[Camera],
     first: &Gaussians,
 ) -> Result<FreeSpace> {
-    if cameras.len() >= FEW_VIEWS || config.iterations() == 0 {
+    let few = cameras.len() < FEW_VIEWS && config.treats_few_views();
+    if !few || config.iterations() == 0 {
         return Ok(FreeSpace::default());
     }
     Ok(FreeSpace::of(cameras, &first.means, &folder.points()?))

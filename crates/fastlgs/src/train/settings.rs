@@ -1,6 +1,6 @@
 //! Translates options into the trainer's configuration.
 
-use super::config::{FeatureMode, Switch, TrainConfig};
+use super::config::{FeatureMode, Preset, Switch, TrainConfig};
 use super::mask_supervision;
 use crate::preprocess::Brightness;
 use fastlgs_core::Gaussians;
@@ -21,7 +21,7 @@ pub fn settings(
 ) -> TrainerConfig {
     let trains_features = config.feature_mode == FeatureMode::Train;
     let background = config.background.unwrap_or_default();
-    TrainerConfig {
+    let settings = TrainerConfig {
         iterations: config.iterations(),
         seed,
         budget: config.budget(views.pixels()),
@@ -53,5 +53,9 @@ pub fn settings(
             Switch::Off => Alignment::Off,
         },
         ..TrainerConfig::default()
+    };
+    match config.preset {
+        Preset::LikePaper => settings.with_schedule_of_3dgs(),
+        _ => settings,
     }
 }
