@@ -272,8 +272,8 @@ impl Calibration {
 
     /// Returns whether absent names reach margins like those of `reference`, in log-odds.
     ///
-    /// Compares what 7 % of absent names reach among [`TYPICAL_OBJECTS`]. The values may differ by
-    /// [`MOST_DIFFERENCE`] times the scale of `reference`.
+    /// Compares what 7 % of absent names reach among 60 objects. The values may differ by the scale of
+    /// `reference`.
     pub fn agrees_with(&self, reference: &Self) -> bool {
         let [own, other] = [self, reference].map(|c| c.absent.quantile(0.93, TYPICAL_OBJECTS));
         (own - other).abs() <= MOST_DIFFERENCE * reference.absent.scale
