@@ -386,6 +386,22 @@ fn onnx_exports_of_sam_and_clip() {
             .is_some_and(|t| t > 0.0),
         "{measured}"
     );
+    // Another text tower is refused, although its embeddings have the same length.
+    let foreign = file("foreign.onnx");
+    std::fs::copy(&words, &foreign).expect("a copy");
+    let copied = json(&["query", text(&scene), "red", "--clip-text", text(&foreign)]);
+    assert_eq!(copied["text"], "red");
+    std::fs::copy(&image, &foreign).expect("a copy");
+    assert_fails(
+        &["query", text(&scene), "red", "--clip-text", text(&foreign)],
+        &["--clip-text", "foreign.onnx", "not the text tower"],
+    );
+    // Linux has no DirectML, so that the library is always built without it.
+    assert_eq!(report["onnx"], "cpu");
+    assert_fails(
+        &["query", text(&scene), "red", "--onnx", "directml"],
+        &["directml", "onnxruntime-directml", "ORT_DYLIB_PATH"],
+    );
     // The existing scene keeps the background of its crops. The next scene uses the best
     // background.
     assert_eq!(ask("red")["calibrated"], measured["agrees"], "{measured}");
