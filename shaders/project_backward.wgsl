@@ -117,7 +117,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         e = (e / view.fold + 1u) * view.fold;
 #endif
     }
-    put3(FEATURE, i, sum2.yzw);
+    // Depth moments are no trained values.
+    let trains_depth = view.depth_as_feature == 2u;
+    put3(FEATURE, i, select(sum2.yzw, vec3<f32>(0.0), trains_depth));
 #ifdef WITH_COLOR
     let mean = param3(MEAN, i);
     let s0 = splats[3u * g];
@@ -131,8 +133,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let q_yy = -2.0 * ln2 * s1.x;
     let d_center = vec2<f32>(q_xx * sum0.x + q_xy * sum0.y, q_xy * sum0.x + q_yy * sum0.y);
     // In half-image units, the threshold of density control does not depend on the resolution.
-    stats[g] += length(d_center * 0.5 * vec2<f32>(view.size));
-    stats[view.gaussians + g] += 1.0;
+    // Gaussians are added where colours differ, not where depths do.
+    if !trains_depth {
+        stats[g] += length(d_center * 0.5 * vec2<f32>(view.size));
+        stats[view.gaussians + g] += 1.0;
+    }
 
     // dL/dQ = -1/2 sum p d d^T; dL/dcov = -(Q dL/dQ) Q.
     let d_q_xx = -0.5 * sum0.z;
@@ -219,6 +224,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     d_t.x += d_slope.x * inverse_z;
     d_t.y += d_slope.y * inverse_z;
     d_t.z -= inverse_z * inverse_z * (dot(view.focal, vec2<f32>(d_j_x.x - slope.x * d_j_x.z, d_j_y.y - slope.y * d_j_y.z))) + inverse_z * inverse_z * dot(d_slope, t.xy);
+    if trains_depth {
+        // Section 5.7: through ln z and its square.
+        d_t.z += (sum2.y + 2.0 * log(t.z) * sum2.z) * inverse_z;
+    }
     put3(MEAN, i, transpose(world) * d_t + d_mean_by_color);
 #endif
 }

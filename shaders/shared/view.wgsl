@@ -23,7 +23,8 @@ struct View {
     sh_degree: u32,
     // 1: opacity compensates for the dilation of small Gaussians (2-D Mip filter).
     antialias: u32,
-    // 1: the first feature channel is the depth (for depth images).
+    // 1: the first feature channel is the depth z (for depth images). 2: the features are ln z, its
+    // square, and 1 (for the depth loss).
     depth_as_feature: u32,
     // A tile is finished once the transmittance of all its pixels is below this.
     finished: f32,

@@ -214,6 +214,7 @@ fn measure_setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Resul
         lambda: 0.2,
         feature_weight: 1.0,
         exposure: Exposure::default(),
+        depth_weight: 0.0,
     };
     // The step of `train --feature-mode train`.
     let full = options(Channels::Coupled);
@@ -221,6 +222,7 @@ fn measure_setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Resul
         size: views[0].size(),
         color: vec![pack([128; 3], true); pixels],
         feature: vec![pack([128; 3], true); pixels],
+        depth: Vec::new(),
     };
     (0..views.len()).try_for_each(|id| engine.set_target(id, target.clone()))?;
     let (mut pairs, mut splats_per_pixel) = (0.0, 0.0);

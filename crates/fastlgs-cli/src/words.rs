@@ -340,6 +340,9 @@ pub fn eval(r: &fastlgs::eval::EvalReport) -> String {
         ),
         ("colour", eval_color(r)),
     ];
+    if let Some(depth) = &r.depth {
+        rows.push(("depth", eval_depth(depth)));
+    }
     if r.labels_scored > 0 {
         rows.extend(eval_labels(r));
     }
@@ -386,6 +389,24 @@ fn eval_color(r: &fastlgs::eval::EvalReport) -> String {
         "{}{aligned}, SSIM {:.3}, on held-out photos",
         decibels(r.psnr),
         r.ssim.unwrap_or_default()
+    )
+}
+
+/// Accuracy of the rendered depth.
+fn eval_depth(depth: &fastlgs::eval::DepthQuality) -> String {
+    let median = depth.median_error.map_or_else(
+        || "most pixels are empty".to_owned(),
+        |error| format!("median error {:.1} %", 100.0 * error),
+    );
+    let shares = [
+        depth.above_5_percent,
+        depth.above_10_percent,
+        depth.above_25_percent,
+    ];
+    let [five, ten, quarter] = shares.map(|share| format!("{:.0} %", 100.0 * share));
+    format!(
+        "{median}; {five} of the pixels are off by more than 5 %, {ten} by more than 10 %, {quarter} by more than 25 % ({} held-out photos)",
+        depth.views
     )
 }
 

@@ -27,6 +27,7 @@ pub mod labels;
 pub mod mask_image;
 pub mod mask_list;
 pub mod metrics;
+pub mod normal_map;
 pub mod npy;
 pub mod ply;
 pub mod rng;

@@ -111,6 +111,9 @@ pub struct TargetImage {
     /// [`pack`]ed features (0 to 255 for 0 to 1), row by row; may be empty if features are not
     /// trained.
     pub feature: Vec<u32>,
+    /// Depth of the surface, row by row, in units of the scene; 0 where it is unknown. May be empty
+    /// if no step has a depth loss.
+    pub depth: Vec<f32>,
 }
 
 /// Packs a pixel of a target image. `counts`: whether the loss uses the pixel.
@@ -126,15 +129,16 @@ pub fn pack(values: [u8; 3], counts: bool) -> u32 {
 impl TargetImage {
     /// Returns the size of the planes in bytes.
     pub(crate) fn bytes(&self) -> usize {
-        4 * (self.color.len() + self.feature.len())
+        4 * (self.color.len() + self.feature.len() + self.depth.len())
     }
 
-    /// Returns `[2][padded rows][padded columns]`, the layout on the device. The feature
-    /// loss ignores pixels without a feature.
+    /// Returns `[2][padded rows][padded columns]`, the layout on the device, and a third plane with
+    /// the bits of the depths if there are any. The feature loss ignores pixels without a feature.
     pub(crate) fn padded(&self, view: &View) -> Vec<u32> {
         let mut planes = self.color.clone();
         planes.extend(&self.feature);
         planes.resize(2 * self.color.len(), 0);
+        planes.extend(self.depth.iter().map(|depth| depth.to_bits()));
         view.padded(&planes)
     }
 }
@@ -169,6 +173,10 @@ pub struct StepOptions {
     pub feature_weight: f32,
     /// Exposure of the view.
     pub exposure: Exposure,
+    /// Weight of the depth loss, or 0 for none. It replaces the feature loss: the channels must be
+    /// [`Channels::Coupled`], and the view needs depth moments as features
+    /// ([`View::with_depth_moments`]).
+    pub depth_weight: f32,
 }
 
 /// Losses of a step, and the gradients of parameters that are not stored with the Gaussians.
@@ -345,6 +353,11 @@ pub(crate) fn check_ids(view: &View, ids: &[u16], n: usize) -> Result<()> {
     Ok(())
 }
 
+/// Returns the error of a step with a depth loss towards a target image without depths.
+pub(crate) fn no_depth() -> Error {
+    Error::Invalid("a step with a depth loss needs a target image with depths".to_owned())
+}
+
 /// Bytes that an engine holds, by purpose.
 #[derive(Clone, Copy, Debug, Default, serde::Serialize)]
 pub struct Memory {
@@ -364,7 +377,8 @@ pub struct Memory {
 /// (3..6).
 pub(crate) fn planes(view: &View, options: &StepOptions) -> Vec<Plane> {
     let per_pixel = 1.0 / (3.0 * view.pixels() as f32);
-    let trained = |c: &usize| options.channels.includes(*c);
+    let has_depth = options.depth_weight > 0.0;
+    let trained = |c: &usize| options.channels.includes(*c) && (*c < 3 || !has_depth);
     (0..6usize)
         .filter(trained)
         .map(|channel| Plane {

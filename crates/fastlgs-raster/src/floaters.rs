@@ -34,6 +34,10 @@ const LIMIT_RADIUS: usize = 8;
 /// Smallest number of cameras that must see a point. With two, a wrong match also gives a point:
 /// each point on one line of sight lies on some line of sight of the other camera.
 const MIN_CAMERAS: usize = 3;
+/// Share of the depth of a surface up to which space before it is free.
+const BEFORE_SURFACE: f32 = 0.9;
+/// Number of cameras that must see a surface behind a Gaussian, for it to be removed.
+const MIN_VIEWS: usize = 2;
 /// Share of the median depth of the first Gaussians up to which space near a camera is free. It is
 /// less if more than one in `OUTLIER` of them would lie in it.
 const NEAR_SHARE: f32 = 0.2;
@@ -132,7 +136,11 @@ pub(crate) fn neighbourhood(
 
 /// The free space of all cameras.
 #[derive(Clone, Debug, Default)]
-pub struct FreeSpace(Vec<CameraFreeSpace>);
+pub struct FreeSpace {
+    cameras: Vec<CameraFreeSpace>,
+    /// Number of cameras to which space must be free.
+    min_cameras: usize,
+}
 
 impl FreeSpace {
     /// Computes the free space of `cameras` from the centres of the first Gaussians and from
@@ -153,18 +161,32 @@ impl FreeSpace {
                 }
             }
         }
-        Self(
-            cameras
-                .par_iter()
-                .zip(&seen)
-                .map(|(camera, seen)| CameraFreeSpace::of(camera, means, seen))
-                .collect(),
-        )
+        let of = |(camera, seen): (&Camera, &Vec<Vec3>)| CameraFreeSpace::of(camera, means, seen);
+        Self {
+            cameras: cameras.par_iter().zip(&seen).map(of).collect(),
+            min_cameras: 1,
+        }
+    }
+
+    /// Returns the space before surfaces that at least [`MIN_VIEWS`] cameras see. `maps` has a
+    /// camera and the depths at its pixels, row by row; 0 where no surface is known.
+    pub fn before_surfaces<'a>(maps: impl Iterator<Item = (&'a Camera, &'a [f32])>) -> Self {
+        let of = |(camera, depth): (&Camera, &[f32])| CameraFreeSpace {
+            camera: camera.clone(),
+            depth: depth.iter().map(|depth| BEFORE_SURFACE * depth).collect(),
+            centre: camera.centre(),
+            radius: 0.0,
+        };
+        Self {
+            cameras: maps.map(of).collect(),
+            min_cameras: MIN_VIEWS,
+        }
     }
 
     /// Returns whether a position lies in free space.
     pub(crate) fn contains(&self, place: Vec3) -> bool {
-        self.0.iter().any(|free| free.contains(place))
+        let free = self.cameras.iter().filter(|free| free.contains(place));
+        self.min_cameras > 0 && free.take(self.min_cameras).count() == self.min_cameras
     }
 }
 

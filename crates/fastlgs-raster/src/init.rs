@@ -235,6 +235,7 @@ mod tests {
                     size: [60, 40],
                     color,
                     feature: Vec::new(),
+                    depth: Vec::new(),
                 },
                 gain: [1.0; 3],
             }

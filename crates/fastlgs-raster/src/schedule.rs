@@ -60,6 +60,9 @@ pub struct TrainerConfig {
     pub refine_until: f32,
     /// Share of the iterations, from the start, that run at half the resolution.
     pub coarse_until: f32,
+    /// Weight of the depth loss, or 0 for none.
+    #[serde(default)]
+    pub depth_weight: f32,
     /// Weight of the mean opacity in the loss, in standard deviations of the photos' brightness.
     #[serde(default = "default_mean_opacity_weight")]
     pub mean_opacity_weight: f32,
@@ -93,6 +96,7 @@ impl TrainerConfig {
             refine_from: 500.0 / 30_000.0,
             refine_until: 0.5,
             coarse_until: 0.0,
+            depth_weight: 0.0,
             mean_opacity_weight: 0.0,
             max_dropout: 0.0,
             ..self
@@ -114,6 +118,7 @@ impl Default for TrainerConfig {
             refine_from: default_refine_from(),
             refine_until: 0.4,
             coarse_until: 0.4,
+            depth_weight: 0.0,
             mean_opacity_weight: default_mean_opacity_weight(),
             max_dropout: default_max_dropout(),
             antialias: false,
@@ -138,6 +143,8 @@ const DENSITY_ROUNDS: u32 = 16;
 const BETWEEN_ROUNDS: [u32; 2] = [25, 100];
 /// Steps between opacity resets (3DGS).
 const RESET_EVERY: u32 = 3000;
+/// One of this many steps has a depth loss.
+const DEPTH_EVERY: u32 = 4;
 /// Shares of the iterations, from the end of growth on, at which an automatic budget removes
 /// unimportant Gaussians.
 const PRUNE_AFTER: [f32; 2] = [0.05, 0.25];
@@ -222,6 +229,11 @@ impl TrainerConfig {
             .step_at(self.refine_until)
             .saturating_sub(self.step_at(self.refine_from));
         (growing / DENSITY_ROUNDS).clamp(BETWEEN_ROUNDS[0], BETWEEN_ROUNDS[1])
+    }
+
+    /// Returns whether a step has a depth loss.
+    pub(crate) fn trains_depth(&self, iteration: u32) -> bool {
+        self.depth_weight > 0.0 && self.channels.color() && iteration % DEPTH_EVERY == 0
     }
 
     /// Returns whether the scene may still grow.

@@ -32,7 +32,7 @@ impl Target {
 impl TargetImage {
     /// Returns the image at half the resolution. In each 2x2 block, only pixels that the loss uses
     /// contribute. Colours are averaged. Of codes, the most frequent one is used, because the mean
-    /// of two codes may be near the code of a third object.
+    /// of two codes may be near the code of a third object. Of depths, the first one is used.
     pub(crate) fn halved(&self) -> Self {
         let [w, h] = self.size;
         let size = [w.div_ceil(2), h.div_ceil(2)];
@@ -59,10 +59,18 @@ impl TargetImage {
                 })
                 .collect()
         };
+        let depth_at = |x: u32, y: u32| self.depth[(y * w + x) as usize];
+        let pixels = (0..size[1]).flat_map(|y| (0..size[0]).map(move |x| (2 * x, 2 * y)));
+        let depth = if self.depth.is_empty() {
+            Vec::new()
+        } else {
+            pixels.map(|(x, y)| depth_at(x, y)).collect()
+        };
         Self {
             size,
             color: halve(&self.color, mean),
             feature: halve(&self.feature, mode),
+            depth,
         }
     }
 
@@ -196,6 +204,17 @@ impl Targets {
         })
     }
 
+    /// Returns the views with these depths; see [`TargetImage::depth`].
+    pub fn with_depths(self, depths: impl Fn(usize) -> Vec<f32> + Send + Sync + 'static) -> Self {
+        let read = self.read;
+        Self::new(self.cameras, self.gains, move |id| {
+            Ok(TargetImage {
+                depth: depths(id),
+                ..read(id)?
+            })
+        })
+    }
+
     /// Returns the mean contrast of all images and their fingerprint. The contrast is the standard
     /// deviation of the brightness of the pixels that the loss uses, 0 to 1, averaged over colours.
     ///
@@ -293,6 +312,7 @@ mod tests {
                 size: [2, 2],
                 color,
                 feature: Vec::new(),
+                depth: Vec::new(),
             },
             gain: [1.0; 3],
         };
@@ -345,6 +365,7 @@ mod tests {
                 size: [4, 2],
                 color: plane,
                 feature,
+                depth: Vec::new(),
             },
             gain: [1.0; 3],
         };

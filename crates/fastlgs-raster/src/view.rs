@@ -12,6 +12,9 @@ const TRANSMITTANCE_MIN: f32 = 0.0001;
 /// The same for a training step: half a grey level of a white background.
 const TRANSMITTANCE_TRAINED: f32 = 1.0 / 512.0;
 
+/// Value of [`View::depth_as_feature`] for depth moments.
+pub(crate) const DEPTH_MOMENTS: u32 = 2;
+
 /// Camera and sizes of one frame.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
@@ -48,7 +51,7 @@ pub struct View {
     pub(crate) sh_degree: u32,
     /// 1: opacity compensates for dilation (2-D Mip filter).
     pub(crate) antialias: u32,
-    /// 1: the first feature channel carries the depth.
+    /// 1: the first feature channel is the depth z. 2: the features are ln z, its square, and 1.
     pub(crate) depth_as_feature: u32,
     /// Transmittance below which a pixel ignores further Gaussians.
     pub(crate) min_transmittance: f32,
@@ -111,6 +114,16 @@ impl View {
     pub fn with_depth_as_feature(self) -> Self {
         Self {
             depth_as_feature: 1,
+            ..self
+        }
+    }
+
+    /// Returns the view with ln z, (ln z)^2 and 1 as features, z being the depth of each Gaussian.
+    /// From their blended values, the depth loss computes its gradient.
+    #[must_use]
+    pub fn with_depth_moments(self) -> Self {
+        Self {
+            depth_as_feature: DEPTH_MOMENTS,
             ..self
         }
     }
@@ -296,6 +309,35 @@ impl Planes {
         Self {
             count: planes.len() as u32,
             ..all
+        }
+    }
+}
+
+/// Uniform of `shaders/depth_gradient.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct DepthLoss {
+    /// Image size in pixels.
+    pub size: [u32; 2],
+    /// Quads of four pixels in a padded row.
+    pub quads: u32,
+    /// Number of padded rows.
+    pub rows: u32,
+    /// Loss weight of one pixel.
+    pub scale: f32,
+    /// Padding to 16 bytes.
+    pub unused: [u32; 3],
+}
+
+impl DepthLoss {
+    /// Returns the uniform of a view whose mean depth loss has this weight.
+    pub(crate) fn new(view: &View, weight: f32) -> Self {
+        Self {
+            size: view.size,
+            quads: 2 * view.tiles[0],
+            rows: TILE * view.tiles[1],
+            scale: weight / view.pixels() as f32,
+            unused: [0; 3],
         }
     }
 }

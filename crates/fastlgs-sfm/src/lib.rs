@@ -7,6 +7,7 @@
 
 pub mod brightness;
 pub mod bundle;
+pub mod depth_map;
 pub mod frame;
 pub mod keypoints;
 pub mod matching;
@@ -22,6 +23,7 @@ pub mod similarity;
 #[path = "../../../tests/support/skip.rs"]
 mod skip;
 pub mod structure;
+pub mod surfaces;
 pub mod sweep;
 pub mod tracks;
 pub mod triangulate;

@@ -116,6 +116,7 @@ mod tests {
                 size: [8, 4],
                 color,
                 feature: Vec::new(),
+                depth: Vec::new(),
             },
             gain: [1.0; 3],
         };

@@ -3,7 +3,7 @@
 use crate::error::bail;
 use crate::query::ViewChoice;
 use crate::{Result, Run, Scene};
-use fastlgs_core::{exr_image, image_io, turbo};
+use fastlgs_core::{exr_image, image_io, normal_map, turbo};
 use image::{Rgb, RgbImage};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -18,6 +18,9 @@ pub enum RenderContent {
     Color,
     /// Expected depth in world units, as EXR.
     Depth,
+    /// Normals of the rendered depth in camera axes (x right, y down, z forward), as PNG: 0 to 255
+    /// for -1 to 1, and black where nothing is rendered.
+    Normal,
     /// The three features, as EXR.
     Feature,
     /// Object ids as colours, as PNG.
@@ -124,6 +127,13 @@ pub fn render(config: &RenderConfig, run: &Run) -> Result<RenderReport> {
             let unit = scene.manifest().frame.scale as f32;
             depth.iter_mut().for_each(|depth| *depth *= unit);
             exr_image::write(&path("depth", "exr"), w, h, &[("Z", &depth)])?;
+        }
+        if config.what.contains(&RenderContent::Normal) {
+            let depth = timed(&mut rendered, || scene.render_depth(camera))?;
+            let normals = normal_map::normals(camera, &depth);
+            let color = |x, y| Rgb(normal_map::color(normals[y as usize * w + x as usize]));
+            let picture = RgbImage::from_fn(camera.width, camera.height, color);
+            image_io::save_png(&path("normal", "png"), picture)?;
         }
         if config.what.contains(&RenderContent::Objects) {
             let ids = timed(&mut rendered, || scene.field(camera, None))?.owners(&*scene.grid()?);

@@ -4,7 +4,7 @@ use super::footprint::{Footprint, span};
 use super::harmonics::basis;
 use super::{ALPHA_MAX, ALPHA_MIN, NEAR, SOLID_OPACITY, Splat, covariance, pcg3d};
 use crate::View;
-use crate::view::{TILE, stride};
+use crate::view::{DEPTH_MOMENTS, TILE, stride};
 use fastlgs_core::gaussians::{BASE_CHANNELS, SH_C0, TRANSPARENT_LOGIT, rest_len, sigmoid};
 use glam::{Mat4, UVec3, Vec2, Vec3};
 
@@ -105,10 +105,10 @@ pub(crate) fn project_one(view: &View, g: u32, param: impl Fn(usize) -> f32) -> 
         ],
     ];
     let color = color_of(view, mean, &param).max(Vec3::ZERO);
-    let f = if view.depth_as_feature == 1 {
-        Vec3::new(t.z, 0.0, 0.0)
-    } else {
-        param3(14)
+    let f = match view.depth_as_feature {
+        0 => param3(14),
+        DEPTH_MOMENTS => Vec3::new(t.z.ln(), t.z.ln() * t.z.ln(), 1.0),
+        _ => Vec3::new(t.z, 0.0, 0.0),
     };
     let log2e = std::f32::consts::LOG2_E;
     let (qa, qb, qc) = (cyy / det, -cxy / det, cxx / det);

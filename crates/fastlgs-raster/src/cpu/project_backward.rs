@@ -4,7 +4,7 @@ use super::harmonics::{basis, basis_slopes};
 use super::{ALPHA_MAX, DILATION, Splat, covariance};
 use crate::View;
 use crate::channels::Channels;
-use crate::view::stride;
+use crate::view::{DEPTH_MOMENTS, stride};
 use fastlgs_core::gaussians::{BASE_CHANNELS, SH_C0, rest_len, sigmoid};
 use glam::{Mat4, Vec2, Vec3, Vec4};
 
@@ -46,7 +46,7 @@ pub fn project_backward(
             &slot,
             store_gradient,
         ) {
-            Some(length) if channels.color() => {
+            Some(length) if channels.color() && view.depth_as_feature != DEPTH_MOMENTS => {
                 stats[g as usize] += length;
                 stats[(view.gaussians + g) as usize] += 1.0;
             }
@@ -70,7 +70,7 @@ fn sum_of(slots: &[f32], floats: usize, pairs: impl Iterator<Item = u32>) -> [f3
 }
 
 /// Propagates the summed slot of one Gaussian to its trained values, and passes each gradient to
-/// `put(channel, gradient)`. Formulas and symbols are those of docs/how-it-works.md, 5.2 to 5.6.
+/// `put(channel, gradient)`. Formulas and symbols are those of docs/how-it-works.md, 5.2 to 5.7.
 ///
 /// Returns the length of the gradient of the projected mean in half-image units, 0 with frozen
 /// geometry, or none if the Gaussian is not drawn.
@@ -85,7 +85,10 @@ pub(crate) fn backward_one(
 ) -> Option<f32> {
     let param3 = |c: usize| Vec3::new(param(c), param(c + 1), param(c + 2));
     let mut put3 = |c: usize, v: Vec3| (0..3).for_each(|k| put(c + k, v[k]));
-    put3(14, Vec3::new(slot[9], slot[10], slot[11]));
+    let trains_depth = view.depth_as_feature == DEPTH_MOMENTS;
+    let d_feature = Vec3::new(slot[9], slot[10], slot[11]);
+    // Depth moments are no trained values.
+    put3(14, if trains_depth { Vec3::ZERO } else { d_feature });
     if !channels.color() {
         return drawn.then_some(0.0);
     }
@@ -160,7 +163,11 @@ pub(crate) fn backward_one(
     let m = [r.col(0) * s.x, r.col(1) * s.y, r.col(2) * s.z];
     let d_jw = [d_a_x, d_a_y].map(|d_a| m[0] * d_a.x + m[1] * d_a.y + m[2] * d_a.z);
     let world = covariance::world_to_camera_rotation(view);
-    let d_t = camera_gradient(view, t, d_center, d_jw.map(|d_jw| world * d_jw));
+    let mut d_t = camera_gradient(view, t, d_center, d_jw.map(|d_jw| world * d_jw));
+    if trains_depth {
+        // Section 5.7: through ln z and its square.
+        d_t.z += (d_feature.x + 2.0 * t.z.ln() * d_feature.y) / t.z;
+    }
     let mut put3 = |c: usize, v: Vec3| (0..3).for_each(|k| put(c + k, v[k]));
     put3(3, s * d_scale);
     put3(0, world.transpose() * d_t + d_mean_by_color);

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::channels::Channels;
-use crate::view::{ChunkJob, Planes, Step, View};
+use crate::view::{ChunkJob, DepthLoss, Planes, Step, View};
 use bytemuck::{Pod, cast_slice, cast_slice_mut};
 
 /// Calls a twin with its first arguments and its buffers. A buffer is `words` (u32), or `read` or
@@ -34,6 +34,8 @@ pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut 
         "scan_apply" => call!(scan_apply(&job(uniform)), b, [items: words, totals: words]),
         "adam" => call!(adam(&of::<Step>(uniform)), b,
             [gradients: read, params: write, moment1: write, moment2: write]),
+        "depth_gradient" => call!(depth_gradient(&of::<DepthLoss>(uniform)), b,
+            [frame: read, targets: words, gradient: write]),
         "ssim_rows" | "ssim_columns" | "ssim_backward_rows" | "loss_gradient" => {
             run_loss(name, &of(uniform), b);
         }

@@ -32,6 +32,7 @@ pub struct Training {
     pub ssim_columns: TypedPass<shaders::SsimColumns>,
     pub ssim_backward_rows: TypedPass<shaders::SsimBackwardRows>,
     pub loss_gradient: TypedPass<shaders::LossGradient>,
+    pub depth_gradient: TypedPass<shaders::DepthGradient>,
     pub adam: TypedPass<shaders::Adam>,
 }
 
@@ -89,6 +90,7 @@ impl Kernels {
                 ssim_columns: pass!(),
                 ssim_backward_rows: pass!(),
                 loss_gradient: pass!(),
+                depth_gradient: pass!(),
                 adam: pass!(),
             },
             blend_ids: pass!(),

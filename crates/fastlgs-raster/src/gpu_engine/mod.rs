@@ -12,7 +12,7 @@ use crate::channels::Channels;
 use crate::density::State;
 use crate::engine::{
     Engine, ExposedPhoto, Frame, Losses, Memory, StepOptions, TargetImage, check_ids,
-    check_saliency, planes,
+    check_saliency, no_depth, planes,
 };
 use crate::lift::{Vote, check_labels};
 use crate::pass::Recorder;
@@ -30,6 +30,13 @@ use picture::{Loss, Picture};
 use std::collections::{BTreeMap, HashMap};
 use wgpu::Buffer;
 
+/// A target image on the device.
+struct DeviceTarget {
+    size: [u32; 2],
+    has_depth: bool,
+    planes: Buffer,
+}
+
 /// [`Engine`] on a wgpu adapter.
 pub struct GpuEngine {
     pub(crate) gpu: Gpu,
@@ -40,7 +47,7 @@ pub struct GpuEngine {
     /// Created on the first step.
     loss: Option<Loss>,
     slots: Slots,
-    targets: HashMap<usize, ([u32; 2], Buffer)>,
+    targets: HashMap<usize, DeviceTarget>,
     last: Option<(View, Channels)>,
     /// Number of passes at the start of every frame that run as their CPU twins, to find a faulty
     /// pass. The environment variable `FASTLGS_PASSES_ON_CPU` sets it.
@@ -244,10 +251,15 @@ impl Engine for GpuEngine {
             tiles: target.size.map(|s| s.div_ceil(crate::view::TILE)),
             ..bytemuck::Zeroable::zeroed()
         };
-        let buffer = self
+        let planes = self
             .gpu
             .storage_with("a target image", &target.padded(&camera_less))?;
-        self.targets.insert(id, (target.size, buffer));
+        let target = DeviceTarget {
+            size: target.size,
+            has_depth: !target.depth.is_empty(),
+            planes,
+        };
+        self.targets.insert(id, target);
         self.lists.forget_view(id);
         Ok(())
     }
@@ -348,17 +360,16 @@ impl Engine for GpuEngine {
             &view,
             planes(&view, options).len(),
         )?);
-        let target = self
-            .targets
-            .get(&id)
-            .filter(|t| t.0 == view.size)
-            .map(|t| &t.1);
+        let target = self.targets.get(&id).filter(|t| t.size == view.size);
         let target = target.ok_or_else(|| {
             Error::Invalid(format!(
                 "view {id} has no target image of {}x{} pixels",
                 view.size[0], view.size[1]
             ))
         })?;
+        if options.depth_weight > 0.0 && !target.has_depth {
+            return Err(no_depth());
+        }
         let (Some(g), Some(picture), Some(loss)) = (&self.gaussians, &self.picture, &self.loss)
         else {
             unreachable!("prepared above")
@@ -370,7 +381,7 @@ impl Engine for GpuEngine {
             &view,
             options,
             &picture.frame,
-            target,
+            &target.planes,
         )?;
         let blending = self.kernels.blending(kind(&view, channels));
         self.slots.record(
@@ -403,7 +414,7 @@ impl Engine for GpuEngine {
         self.loss.iter().for_each(|l| l.count(&mut memory));
         self.lists.count(&mut memory);
         memory.lists += self.slots.bytes();
-        memory.views += self.targets.values().map(|t| t.1.size()).sum::<u64>();
+        memory.views += self.targets.values().map(|t| t.planes.size()).sum::<u64>();
         memory
     }
 

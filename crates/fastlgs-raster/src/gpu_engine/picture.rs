@@ -6,10 +6,11 @@ use crate::cpu::ROWS_PER_INVOCATION;
 use crate::engine::{Losses, Memory, StepOptions, losses_from_sums, planes};
 use crate::pass::{Groups, Recorder};
 use crate::shader::shaders::{
-    LossGradientBuffers, SsimBackwardRowsBuffers, SsimColumnsBuffers, SsimRowsBuffers,
+    DepthGradientBuffers, LossGradientBuffers, SsimBackwardRowsBuffers, SsimColumnsBuffers,
+    SsimRowsBuffers,
 };
 use crate::shape::Shape;
-use crate::view::{Planes, View};
+use crate::view::{DepthLoss, Planes, View};
 use crate::{Gpu, Result};
 use wgpu::Buffer;
 
@@ -142,6 +143,19 @@ impl Loss {
                     sums,
                 },
                 by_column,
+            )?;
+        }
+        if options.depth_weight > 0.0 {
+            let loss = DepthLoss::new(view, options.depth_weight);
+            r.run(
+                &passes.depth_gradient,
+                &loss,
+                DepthGradientBuffers {
+                    frame,
+                    targets,
+                    gradient,
+                },
+                (loss.quads * loss.rows).div_ceil(GROUP),
             )?;
         }
         Ok(())

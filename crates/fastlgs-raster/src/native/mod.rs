@@ -13,10 +13,10 @@ use crate::cpu;
 use crate::density::State;
 use crate::engine::{
     Engine, ExposedPhoto, Frame, Losses, Memory, StepOptions, TargetImage, check_ids,
-    check_saliency, planes, rendered,
+    check_saliency, no_depth, planes, rendered,
 };
 use crate::lift::{Vote, check_labels};
-use crate::view::{Step, View};
+use crate::view::{DEPTH_MOMENTS, DepthLoss, Step, View};
 use crate::{Error, Result};
 use blend::{BackwardInput, Blended, EDGE, Job, Tile};
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
@@ -112,6 +112,26 @@ fn blended<const COLOR: bool, const FEATURE: bool>(
         }
     }
     out
+}
+
+/// Writes dL/d frame of the depth moments. `depth` is the target `[h][w]` without padding.
+fn depth_gradient(
+    loss: &DepthLoss,
+    frame: &TiledPlanes<8>,
+    depth: &[f32],
+    gradient: &mut TiledPlanes<6>,
+) {
+    let [width, padded] = [loss.size[0] as usize, gradient.width];
+    let rows = gradient.rows_mut().zip(depth.par_chunks_exact(width));
+    rows.enumerate().for_each(|(y, (out, depth))| {
+        let moments = [3, 4, 5].map(|channel| frame.row(channel, y));
+        for (x, depth) in depth.iter().enumerate() {
+            let by_moments = cpu::depth_gradient_at(moments.map(|row| row[x]), *depth, loss.scale);
+            for (channel, value) in (3..6).zip(by_moments) {
+                out[channel * padded + x] = value;
+            }
+        }
+    });
 }
 
 /// Returns [`blended`] for these channels.
@@ -282,7 +302,9 @@ impl CpuEngine {
                         &slot,
                         put,
                     );
-                    if let Some(length) = gradient_length.filter(|_| channels.color()) {
+                    let counts_gradient =
+                        channels.color() && view.depth_as_feature != DEPTH_MOMENTS;
+                    if let Some(length) = gradient_length.filter(|_| counts_gradient) {
                         lengths[k] += length;
                         counts[k] += 1.0;
                     }
@@ -470,7 +492,11 @@ impl Engine for CpuEngine {
                 view.size[0], view.size[1]
             )));
         }
-        if channels.feature() {
+        if options.depth_weight > 0.0 {
+            if self.targets[&id].depth.is_empty() {
+                return Err(no_depth());
+            }
+        } else if channels.feature() {
             // Pixels without a feature do not enter the loss.
             let target = self.targets.get_mut(&id).expect("checked above");
             target.color.resize(2 * view.pixels(), 0);
@@ -497,6 +523,12 @@ impl Engine for CpuEngine {
                 );
             }
         });
+        if options.depth_weight > 0.0 {
+            let loss = DepthLoss::new(&view, options.depth_weight);
+            self.timed("depth_gradient", |s| {
+                depth_gradient(&loss, &s.frame, &s.targets[&id].depth, &mut s.gradient);
+            });
+        }
         self.timed("blend_backward", |s| match channels {
             Channels::Color => s.blend_backward::<true, false, false>(&view),
             Channels::Feature => s.blend_backward::<false, true, false>(&view),

@@ -60,6 +60,7 @@ fn align_restores_a_displaced_camera() {
         size: [203, 151],
         color: (0..203 * 151).map(pixel).collect(),
         feature: Vec::new(),
+        depth: Vec::new(),
     };
     let mut rng = Rng::new(1, "poses");
     for _ in 0..3 {

@@ -284,6 +284,7 @@ fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
         size: view.size,
         color: plane(0),
         feature: plane(3),
+        depth: Vec::new(),
     };
     let target_values: Vec<f64> = (0..6 * pixels)
         .map(|i| f64::from(wave(i)) / 255.0)
@@ -300,6 +301,7 @@ fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
         lambda: LAMBDA as f32,
         feature_weight: FEATURE_WEIGHT as f32,
         exposure,
+        depth_weight: 0.0,
     };
     engine
         .step(
@@ -384,6 +386,7 @@ fn check_limit(engine: &mut dyn Engine) {
         size: view.size,
         color: vec![pack([255; 3], true); SIZE.0 * SIZE.1],
         feature: Vec::new(),
+        depth: Vec::new(),
     };
     engine.set_target(0, target).unwrap();
     let exposure = Exposure {
@@ -395,6 +398,7 @@ fn check_limit(engine: &mut dyn Engine) {
         lambda: 0.0,
         feature_weight: 0.0,
         exposure,
+        depth_weight: 0.0,
     };
     engine
         .step(

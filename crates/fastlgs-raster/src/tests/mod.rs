@@ -117,6 +117,7 @@ pub(crate) fn target(width: u32, height: u32) -> TargetImage {
         size: [width, height],
         color: plane(0),
         feature: plane(3),
+        depth: Vec::new(),
     }
 }
 

@@ -42,7 +42,10 @@ impl Trainer {
         }
         if !self.loaded_targets.views.contains_key(&id) {
             let started = Instant::now();
-            let image = self.targets.get(id)?.image;
+            let mut image = self.targets.get(id)?.image;
+            if self.training.config.depth_weight > 0.0 && image.depth.is_empty() {
+                image.depth = vec![0.0; image.color.len()];
+            }
             let image = if coarse { image.halved() } else { image };
             let bytes = image.bytes();
             self.engine.set_target(id, image)?;

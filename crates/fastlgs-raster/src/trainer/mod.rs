@@ -203,29 +203,38 @@ impl Trainer {
             camera.clone()
         };
         let degree = config.degree(iteration);
-        let channels = self.channels();
+        let has_depth = config.trains_depth(iteration);
+        let channels = if has_depth {
+            Channels::Coupled
+        } else {
+            self.channels()
+        };
         let options = StepOptions {
             channels,
             lambda: config.lambda,
             feature_weight: config.feature_weight,
             exposure: self.exposure(id),
+            depth_weight: if has_depth { config.depth_weight } else { 0.0 },
         };
         let rates = config.rates(iteration, self.extent);
         let trained = match channels {
+            _ if has_depth => 0..FEATURE.start,
             Channels::Feature => FEATURE.start..BASE_CHANNELS,
             Channels::Color | Channels::Both | Channels::Coupled => 0..gaussians::channels(degree),
         };
         let mut step = Step::new(iteration + 1, trained, &rates);
         step.opacity_weight = config.opacity_weight(iteration, self.engine.len(), self.contrast);
         let left_out = config.dropout(iteration, self.targets.len());
-        self.engine.step(
-            self.view(&camera, degree)
-                .for_training()
-                .with_dropout(left_out, config.step_seed(iteration)),
-            id,
-            &options,
-            &step,
-        )?;
+        let view = self
+            .view(&camera, degree)
+            .for_training()
+            .with_dropout(left_out, config.step_seed(iteration));
+        let view = if has_depth {
+            view.with_depth_moments()
+        } else {
+            view
+        };
+        self.engine.step(view, id, &options, &step)?;
         self.enforce_limit(id);
         if config.exposure || config.learn_background {
             let losses = self.engine.losses()?;

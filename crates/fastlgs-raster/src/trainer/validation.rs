@@ -50,6 +50,7 @@ impl Trainer {
     pub(super) fn prune(&mut self) -> Result<()> {
         let mut whole = self.engine.state()?;
         whole.keep_finite();
+        whole.remove_where(|mean| self.free_space.contains(mean));
         self.replace(&whole)?;
         let (scores, squared_error) = self.saliency()?;
         let cost_views = self.cost_views();
@@ -140,6 +141,7 @@ mod tests {
                 size: [64, 48],
                 color,
                 feature: Vec::new(),
+                depth: Vec::new(),
             },
             gain: [1.0; 3],
         };

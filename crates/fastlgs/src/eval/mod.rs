@@ -1,11 +1,13 @@
 //! Measures accuracy on held-out views. `docs/guide.md` defines the measures.
 
 mod color;
+mod depth;
 
 use crate::absent::{ABSENT, COLORS};
 use crate::error::{Context, bail};
 use crate::query::object_query::ObjectQuery;
 use crate::{Result, Run, Scene};
+pub use depth::DepthQuality;
 use fastlgs_core::labels::{Label, LabelledView};
 use fastlgs_core::{Camera, labels, metrics};
 use fastlgs_grid::Grid;
@@ -44,6 +46,17 @@ pub struct EvalConfig {
     /// CLIP text tower, for scenes with imported embeddings, or if its file has moved.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
     pub clip_text: Option<PathBuf>,
+    /// Folder of true depth maps of held-out views, named as their photos: grey PNG of 16 bits, or
+    /// EXR in world units. 0 means unknown.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "FOLDER"))]
+    pub depth: Option<PathBuf>,
+    /// Depth in world units of one step of the PNG files of --depth. The default suits millimetres
+    /// in a scene in metres.
+    #[cfg_attr(
+        feature = "clap",
+        arg(long, value_name = "UNITS", default_value_t = 0.001)
+    )]
+    pub depth_unit: f32,
 }
 
 impl Default for EvalConfig {
@@ -57,6 +70,8 @@ impl Default for EvalConfig {
             false_alarms,
             absent: None,
             clip_text: None,
+            depth: None,
+            depth_unit: 0.001,
         }
     }
 }
@@ -128,6 +143,8 @@ pub struct EvalReport {
     pub psnr_affine: Option<f64>,
     /// SSIM of the held-out views.
     pub ssim: Option<f64>,
+    /// Accuracy of the rendered depth; `None` without true depth.
+    pub depth: Option<DepthQuality>,
     /// Number of Gaussians.
     pub gaussians: usize,
     /// Number of objects, parts included.
@@ -217,6 +234,10 @@ pub fn eval_scene(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport> {
     scene.ignore_taught_names();
     let grid = scene.grid()?;
     let color = color::quality(&mut scene)?;
+    let depth_folder = config.depth.as_deref();
+    let depth = depth_folder
+        .map(|folder| depth::quality(&mut scene, folder, config.depth_unit))
+        .transpose()?;
     let label_text = config.label_text.as_deref();
     let views = config
         .labels
@@ -240,6 +261,7 @@ pub fn eval_scene(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport> {
         psnr_aligned: color.map(|c| c.psnr_aligned),
         psnr_affine: color.map(|c| c.psnr_affine),
         ssim: color.map(|c| c.ssim),
+        depth,
         gaussians: scene.gaussians().len(),
         objects: grid.objects.len(),
         scene_bytes: crate::scene::query_file_bytes(&config.scene),

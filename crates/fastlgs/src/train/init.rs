@@ -3,7 +3,9 @@
 use super::config::{Background, TrainConfig};
 use super::report::TrainReport;
 use crate::error::bail;
+use crate::masks;
 use crate::{Result, Run, SceneNotes};
+use fastlgs_core::dataset::SfmPoint;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, WorldFrame, image_io, splat_file};
@@ -12,6 +14,8 @@ use fastlgs_raster::density::State;
 use fastlgs_raster::{
     Channels, FEW_VIEWS, FreeSpace, Target, TargetImage, Targets, View, init, pack,
 };
+use fastlgs_sfm::depth_map::DepthMap;
+use fastlgs_sfm::surfaces::Surfaces;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -25,6 +29,7 @@ pub fn gaussians(
     config: &TrainConfig,
     folder: &SceneFolder,
     views: &Targets,
+    surfaces: Option<&Surfaces>,
     run: &Run,
 ) -> Result<Gaussians> {
     if let Some(path) = &config.init {
@@ -44,6 +49,9 @@ pub fn gaussians(
     }
     let mut rng = Rng::new(run.seed, "init");
     let mut points = folder.points()?;
+    if let Some(surfaces) = surfaces {
+        points.extend(surface_points(surfaces, views)?);
+    }
     // Start with at most half of the budget, so that density control can add Gaussians.
     let most = (config.budget(views.pixels()).max_gaussians() / 2).max(1);
     // Photos with an alpha channel show a cut-out object, which needs no backdrop.
@@ -69,6 +77,37 @@ pub fn gaussians(
     let mut first = init::from_points(&points);
     first.append(backdrop);
     Ok(first)
+}
+
+/// Returns the surfaces of the training views: planes through the points that their masks show.
+pub fn surfaces(folder: &SceneFolder, cameras: &[Camera]) -> Result<Surfaces> {
+    let points = folder.points()?;
+    let masks = |view: usize| masks::whole_masks(folder, &cameras[view]);
+    Surfaces::new(cameras, &points, masks)
+}
+
+/// Returns points on surfaces where no point is known, with the colours of the photos.
+fn surface_points(surfaces: &Surfaces, views: &Targets) -> Result<Vec<SfmPoint>> {
+    let images = (0..views.len()).map(|id| views.get(id).map(|target| target.image));
+    let images: Vec<TargetImage> = images.collect::<Result<_, _>>()?;
+    Ok(surfaces.new_points(|view, place| {
+        let image = &images[view];
+        let [x, y] = [place.x, place.y];
+        let [width, height] = image.size;
+        let (x, y) = ((x * width as f32) as u32, (y * height as f32) as u32);
+        let [r, g, b, _] = image.color[(y * width + x) as usize].to_le_bytes();
+        [r, g, b]
+    }))
+}
+
+/// Returns the targets with the depths of surfaces, one map for each view.
+pub fn with_depths(targets: Targets, maps: Vec<DepthMap>) -> Targets {
+    let sizes: Vec<[u32; 2]> = targets
+        .cameras
+        .iter()
+        .map(|camera| [camera.width, camera.height])
+        .collect();
+    targets.with_depths(move |id| maps[id].resized(sizes[id][0], sizes[id][1]))
 }
 
 /// Number of training views that decide whether the axes of an imported file are flipped.
@@ -273,6 +312,7 @@ pub fn target(
             size: [camera.width, camera.height],
             color,
             feature,
+            depth: Vec::new(),
         },
         gain: [1.0; 3],
     })

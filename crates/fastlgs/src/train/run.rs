@@ -5,7 +5,10 @@ use crate::progress::{Message, TrainStep};
 use crate::train::settings::settings;
 use crate::{Result, Run, checkpoints, objects, stop_point, transparent};
 use fastlgs_core::{Camera, Gaussians};
-use fastlgs_raster::{Choice, Engine, Progress, Targets, Trainer, TrainerConfig, TrainerReport};
+use fastlgs_raster::{
+    Choice, Engine, FreeSpace, Progress, Targets, Trainer, TrainerConfig, TrainerReport,
+};
+use fastlgs_sfm::surfaces::Surfaces;
 use std::time::Instant;
 
 /// Trained Gaussians, and the data of their training that the report needs.
@@ -38,7 +41,20 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
     held_out.check()?;
     let device = fastlgs_raster::choice(run.device);
     let mut engine = fastlgs_raster::open_engine(&device.device)?;
-    let first = initial_gaussians(inputs, &targets, &mut *engine, run)?;
+    let surfaces = if config.init.is_none() && !std::env::var("NO_SURF").is_ok() {
+        Some(init::surfaces(folder, &inputs.training)?)
+    } else {
+        None
+    };
+    let first = initial_gaussians(inputs, &targets, surfaces.as_ref(), &mut *engine, run)?;
+    let before_surfaces = surfaces.as_ref().map(|surfaces| {
+        let maps = surfaces.maps.iter();
+        FreeSpace::before_surfaces(maps.map(|map| (&map.camera, map.depth.as_slice())))
+    });
+    let targets = match surfaces {
+        Some(surfaces) => init::with_depths(targets, surfaces.maps),
+        None => targets,
+    };
     let kept_transparent = match config.mapping {
         Mapping::Keep => transparent::take_transparent(&mut folder.gaussians()?),
         Mapping::Paper | Mapping::Global => Gaussians::default(),
@@ -49,7 +65,11 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
     let free = init::free_space(config, folder, &inputs.training, &first)?;
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
-    trainer.set_free_space(free);
+    if let (Some(before), true) = (before_surfaces, std::env::var("FS").is_ok()) {
+        trainer.set_free_space(before);
+    } else {
+        trainer.set_free_space(free);
+    }
     resume(&mut trainer, inputs, run)?;
     run.progress.on_message(Message::TrainingBegins(&first));
     let mut watch = ProgressWatcher {
@@ -93,11 +113,12 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
 fn initial_gaussians(
     inputs: &Inputs,
     targets: &Targets,
+    surfaces: Option<&Surfaces>,
     engine: &mut dyn Engine,
     run: &Run,
 ) -> Result<Gaussians> {
     let config = &inputs.config;
-    let mut first = init::gaussians(config, &inputs.folder, targets, run)?;
+    let mut first = init::gaussians(config, &inputs.folder, targets, surfaces, run)?;
     // Gaussians of transparent objects have no colour to train.
     transparent::take_transparent(&mut first);
     let has_features = config.init.is_some() && config.mapping == Mapping::Keep;

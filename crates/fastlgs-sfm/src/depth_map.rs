@@ -1,0 +1,81 @@
+//! Depth maps of views.
+
+use fastlgs_core::Camera;
+use glam::{Vec2, Vec3};
+
+/// Relative depth difference of neighbouring pixels up to which they show one surface.
+const SAME_SURFACE: f32 = 0.1;
+
+/// Depths at the pixels of a camera, in units of the scene.
+#[derive(Clone)]
+pub struct DepthMap {
+    /// The camera; its size is that of the map.
+    pub camera: Camera,
+    /// Depth of each pixel, row by row; 0 where it is unknown.
+    pub depth: Vec<f32>,
+}
+
+impl DepthMap {
+    /// Returns a map without known depths.
+    pub fn empty(camera: Camera) -> Self {
+        let pixels = (camera.width * camera.height) as usize;
+        Self {
+            camera,
+            depth: vec![0.0; pixels],
+        }
+    }
+
+    /// Adds a point in scene coordinates, unless a nearer one is known at its pixel.
+    pub fn add(&mut self, position: Vec3) {
+        if let Some((pixel, depth)) = self.camera.pixel_and_depth(position) {
+            let known = &mut self.depth[pixel];
+            if *known <= 0.0 || depth < *known {
+                *known = depth;
+            }
+        }
+    }
+
+    /// Returns the position of a pixel's surface in scene coordinates.
+    pub fn point(&self, pixel: usize) -> Vec3 {
+        let width = self.camera.width as usize;
+        let middle = Vec2::new((pixel % width) as f32 + 0.5, (pixel / width) as f32 + 0.5);
+        let place = self.camera.ray(middle) * self.depth[pixel];
+        self.camera
+            .world_to_camera
+            .inverse()
+            .transform_point3(place)
+    }
+
+    /// Returns the depths at another size, row by row. 1 / depth is interpolated, which is exact on
+    /// planes. The depth is unknown where the four neighbours do not show one surface.
+    pub fn resized(&self, width: u32, height: u32) -> Vec<f32> {
+        let own = [self.camera.width as usize, self.camera.height as usize];
+        let neighbours = |at: u32, side: u32, own: usize| {
+            let place = (at as f32 + 0.5) * own as f32 / side as f32 - 0.5;
+            let place = place.clamp(0.0, own as f32 - 1.0);
+            let first = (place as usize).min(own.saturating_sub(2));
+            (first, (first + 1).min(own - 1), place - first as f32)
+        };
+        let depth = |x: u32, y: u32| {
+            let (left, right, across) = neighbours(x, width, own[0]);
+            let (above, below, down) = neighbours(y, height, own[1]);
+            let at = |x: usize, y: usize| self.depth[y * own[0] + x];
+            let corners = [
+                at(left, above),
+                at(right, above),
+                at(left, below),
+                at(right, below),
+            ];
+            let nearest = corners.into_iter().fold(f32::INFINITY, f32::min);
+            let farthest = corners.into_iter().fold(0.0, f32::max);
+            if nearest <= 0.0 || farthest > (1.0 + SAME_SURFACE) * nearest {
+                return 0.0;
+            }
+            let [a, b, c, d] = corners.map(|depth| 1.0 / depth);
+            let (upper, lower) = (a + (b - a) * across, c + (d - c) * across);
+            1.0 / (upper + (lower - upper) * down)
+        };
+        let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+        pixels.map(|(x, y)| depth(x, y)).collect()
+    }
+}

@@ -1,0 +1,453 @@
+//! Surfaces where photos have no texture: planes through the points that a mask shows.
+//!
+//! Plane sweep stereo finds no depth on bare walls, floors and ceilings, but it finds their edges,
+//! and what hangs on them. If most points of a mask lie on a plane, the whole mask is assumed to
+//! show that plane (as in PlanarGS, 2025). The other views verify each pixel: at least one must see
+//! a surface at the same depth, and not more of them may look through it.
+
+use crate::depth_map::DepthMap;
+use fastlgs_core::dataset::SfmPoint;
+use fastlgs_core::rng::Rng;
+use fastlgs_core::{Camera, LabelMap};
+use glam::{DMat3, DVec3, Vec2, Vec3};
+use rayon::prelude::*;
+use std::collections::{BTreeMap, VecDeque};
+
+/// Longer side of the depth maps, in pixels.
+const SIDE: u32 = 128;
+/// Smallest number of points that determine a plane.
+const MIN_POINTS: usize = 10;
+/// Smallest number of them that the view itself must see. The others are on surfaces that other
+/// views see.
+const MIN_OWN_POINTS: usize = 3;
+/// Largest relative depth error of a point on its plane. It is also the largest standard deviation
+/// of a plane's depth, relative to the depth.
+const TOLERANCE: f64 = 0.02;
+/// Smallest share of a mask's points that lie on its plane.
+const MIN_INLIERS: f64 = 0.3;
+/// Number of planes that RANSAC tries for each mask.
+const TRIALS: usize = 150;
+/// Number of refinements of the best plane by least squares.
+const REFINEMENTS: usize = 3;
+/// Factor by which a plane may extend beyond the nearest and farthest points of its view.
+const RANGE_FACTOR: f64 = 1.5;
+/// Share of the nearest and farthest points that is ignored.
+const OUTLIERS: f64 = 0.01;
+/// Largest number of other views that verify a view.
+const WITNESSES: usize = 24;
+/// Relative depth difference up to which two views see the same surface.
+const SAME_DEPTH: f32 = 0.05;
+/// Factor of depth from which another view looks through a surface.
+const LOOKS_THROUGH: f32 = 1.1;
+/// Spacing of new points in pixels of the depth maps.
+const SPACING: usize = 3;
+
+/// Depth maps of the surfaces that all views show.
+pub struct Surfaces {
+    /// One map for each camera; 0 where no surface is known.
+    pub maps: Vec<DepthMap>,
+    /// Depths of the points themselves, with the same sizes.
+    points: Vec<DepthMap>,
+    /// For each view, the views that share points with it, most first.
+    witnesses: Vec<Vec<usize>>,
+}
+
+impl Surfaces {
+    /// Fits planes to `points`, whose [`SfmPoint::seen_by`] are indices of `cameras`. `masks`
+    /// returns the label map of a view: 0 where there is no mask.
+    ///
+    /// # Errors
+    /// Errors of `masks`.
+    pub fn new<E: Send>(
+        cameras: &[Camera],
+        points: &[SfmPoint],
+        masks: impl Fn(usize) -> Result<LabelMap, E> + Sync,
+    ) -> Result<Self, E> {
+        let seen = points_by_view(cameras.len(), points);
+        let witnesses = witnesses(&seen, points);
+        let views = (0..cameras.len()).into_par_iter().map(|view| {
+            let camera = cameras[view].shrunk_to(SIDE);
+            let labels = shrunk_labels(&camera, &masks(view)?);
+            let seen: Vec<Vec3> = seen[view].iter().map(|p| points[*p].position).collect();
+            let mut known = DepthMap::empty(camera.clone());
+            seen.iter().for_each(|position| known.add(*position));
+            let map = planes(view, DepthMap::empty(camera), &labels, &seen, &[]);
+            Ok((map, (known, (labels, seen))))
+        });
+        let views: Vec<_> = views.collect::<Result<_, E>>()?;
+        let (maps, (known, views)): (_, (_, Vec<_>)) = views.into_iter().unzip();
+        let first = Self {
+            maps,
+            points: known,
+            witnesses,
+        }
+        .verified();
+        // Points on the surfaces of other views support planes of which a view sees few points.
+        let others = first.new_points(|_, _| [0; 3]);
+        let extended = views.par_iter().enumerate().map(|(view, (labels, seen))| {
+            let visible = others.iter().map(|point| point.position);
+            let visible: Vec<Vec3> = visible.filter(|p| first.is_open(view, *p)).collect();
+            planes(view, first.maps[view].clone(), labels, seen, &visible)
+        });
+        let maps = extended.collect();
+        Ok(Self { maps, ..first }.verified())
+    }
+
+    /// Returns whether a view may see `place`: no surface and no nearer point is known at its
+    /// pixel.
+    fn is_open(&self, view: usize, place: Vec3) -> bool {
+        let seen = self.maps[view].camera.pixel_and_depth(place);
+        seen.is_some_and(|(pixel, depth)| {
+            let point = self.points[view].depth[pixel];
+            let is_hidden = point > 0.0 && point < depth * (1.0 - SAME_DEPTH);
+            self.maps[view].depth[pixel] <= 0.0 && !is_hidden
+        })
+    }
+
+    /// Returns the surfaces without the pixels that other views do not confirm.
+    fn verified(self) -> Self {
+        let maps = (0..self.maps.len()).into_par_iter().map(|view| {
+            let map = &self.maps[view];
+            let confirm = |pixel: usize| {
+                let depth = map.depth[pixel];
+                if depth > 0.0 && self.is_confirmed(view, map.point(pixel)) {
+                    depth
+                } else {
+                    0.0
+                }
+            };
+            DepthMap {
+                camera: map.camera.clone(),
+                depth: (0..map.depth.len()).map(confirm).collect(),
+            }
+        });
+        Self {
+            maps: maps.collect(),
+            ..self
+        }
+    }
+
+    /// Returns whether at least one other view sees a surface at `place`, and not more of them look
+    /// through it.
+    fn is_confirmed(&self, view: usize, place: Vec3) -> bool {
+        let [mut same, mut through] = [0; 2];
+        for &other in &self.witnesses[view] {
+            let Some((pixel, depth)) = self.maps[other].camera.pixel_and_depth(place) else {
+                continue;
+            };
+            let surface = self.maps[other].depth[pixel];
+            let point = self.points[other].depth[pixel];
+            if surface > 0.0 && (surface / depth - 1.0).abs() < SAME_DEPTH {
+                same += 1;
+            }
+            if surface.max(point) > LOOKS_THROUGH * depth {
+                through += 1;
+            }
+        }
+        same >= 1 && through <= same
+    }
+
+    /// Returns new points on the surfaces where no point is known, one for each pixel of a grid
+    /// that no other view has covered. `color` returns the colour at a position (0 to 1 of width
+    /// and height) of a view's photo.
+    pub fn new_points(&self, color: impl Fn(usize, Vec2) -> [u8; 3]) -> Vec<SfmPoint> {
+        let is_known = |map: &DepthMap| map.depth.iter().map(|d| *d > 0.0).collect();
+        let mut covered: Vec<Vec<bool>> = self.points.iter().map(is_known).collect();
+        let mut out = Vec::new();
+        for (view, map) in self.maps.iter().enumerate() {
+            let [width, height] = [map.camera.width, map.camera.height].map(|s| s as usize);
+            let grid = (SPACING / 2..height)
+                .step_by(SPACING)
+                .flat_map(|y| (SPACING / 2..width).step_by(SPACING).map(move |x| (x, y)));
+            for (x, y) in grid {
+                let pixel = y * width + x;
+                if map.depth[pixel] <= 0.0 || covered[view][pixel] {
+                    continue;
+                }
+                let position = map.point(pixel);
+                let place = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
+                out.push(SfmPoint {
+                    position,
+                    color: color(view, place / Vec2::new(width as f32, height as f32)),
+                    seen_by: vec![view as u32],
+                });
+                for &other in &self.witnesses[view] {
+                    self.cover(other, position, &mut covered[other]);
+                }
+            }
+        }
+        out
+    }
+
+    /// Marks the pixels of a view around a new point on the same surface.
+    fn cover(&self, view: usize, position: Vec3, covered: &mut [bool]) {
+        let map = &self.maps[view];
+        let Some((pixel, depth)) = map.camera.pixel_and_depth(position) else {
+            return;
+        };
+        let [width, height] = [map.camera.width, map.camera.height].map(|s| s as usize);
+        let reach = SPACING / 2;
+        let around = |at: usize, side: usize| at.saturating_sub(reach)..(at + reach + 1).min(side);
+        for y in around(pixel / width, height) {
+            for x in around(pixel % width, width) {
+                let at = y * width + x;
+                covered[at] |= (map.depth[at] / depth - 1.0).abs() < SAME_DEPTH;
+            }
+        }
+    }
+}
+
+/// Returns the indices of the points that each view sees.
+fn points_by_view(views: usize, points: &[SfmPoint]) -> Vec<Vec<usize>> {
+    let mut seen = vec![Vec::new(); views];
+    for (k, point) in points.iter().enumerate() {
+        for view in &point.seen_by {
+            if let Some(seen) = seen.get_mut(*view as usize) {
+                seen.push(k);
+            }
+        }
+    }
+    seen
+}
+
+/// Returns for each view the other views that see the same points, at most [`WITNESSES`], those
+/// with most common points first.
+fn witnesses(seen: &[Vec<usize>], points: &[SfmPoint]) -> Vec<Vec<usize>> {
+    let of = |(view, seen): (usize, &Vec<usize>)| {
+        let mut common: BTreeMap<usize, usize> = BTreeMap::new();
+        for other in seen.iter().flat_map(|p| &points[*p].seen_by) {
+            if *other as usize != view {
+                *common.entry(*other as usize).or_default() += 1;
+            }
+        }
+        let mut views: Vec<(usize, usize)> = common.into_iter().collect();
+        views.sort_by_key(|(view, count)| (std::cmp::Reverse(*count), *view));
+        views.into_iter().take(WITNESSES).map(|v| v.0).collect()
+    };
+    seen.iter().enumerate().map(of).collect()
+}
+
+/// Points of a mask: camera-space positions, and pixels of the depth map.
+#[derive(Default)]
+struct MaskPoints {
+    positions: Vec<DVec3>,
+    pixels: Vec<usize>,
+    /// Number of points that the view itself sees; they come first.
+    own: usize,
+}
+
+/// Adds the depth of the planes of a view's masks to `map`, where it is unknown. `seen` are the
+/// points that the view sees, `others` further points that it may see.
+///
+/// Each pixel takes the plane of the nearest point within its mask, and none if that point lies on
+/// no plane. A mask may show several planes, such as the walls of a room.
+fn planes(
+    view: usize,
+    mut map: DepthMap,
+    labels: &[u16],
+    seen: &[Vec3],
+    others: &[Vec3],
+) -> DepthMap {
+    let mut masks: BTreeMap<u16, MaskPoints> = BTreeMap::new();
+    let mut depths = Vec::new();
+    let projected = |point: &Vec3| {
+        let (pixel, depth) = map.camera.pixel_and_depth(*point)?;
+        let position = map.camera.world_to_camera.transform_point3(*point);
+        Some((pixel, f64::from(depth), position.as_dvec3()))
+    };
+    let seen: Vec<_> = seen.iter().filter_map(projected).collect();
+    for (pixel, depth, position) in &seen {
+        depths.push(*depth);
+        let mask = masks.entry(labels[*pixel]).or_default();
+        mask.positions.push(*position);
+        mask.pixels.push(*pixel);
+        mask.own += 1;
+    }
+    for (pixel, depth, position) in others.iter().filter_map(projected) {
+        depths.push(depth);
+        if let Some(mask) = masks.get_mut(&labels[pixel]) {
+            mask.positions.push(position);
+            mask.pixels.push(pixel);
+        }
+    }
+    masks.remove(&0);
+    let Some(range) = depth_range(depths) else {
+        return map;
+    };
+    let mut rng = Rng::new(view as u64, "planes");
+    let mut all_planes = Vec::new();
+    let mut seeds = Vec::new();
+    for points in masks.values() {
+        let (planes, plane_of_point) = Plane::fit_all(&points.positions, points.own, &mut rng);
+        let first = all_planes.len();
+        let number = |plane: Option<usize>| plane.map(|plane| first + plane);
+        let numbers = plane_of_point.into_iter().map(number);
+        let inside = points.pixels.iter().copied().zip(numbers);
+        seeds.extend(inside);
+        all_planes.extend(planes);
+    }
+    let width = map.camera.width as usize;
+    let plane_of_pixel = spread(labels, width, &seeds);
+    for (pixel, plane) in plane_of_pixel.into_iter().enumerate() {
+        if map.depth[pixel] > 0.0 {
+            continue;
+        }
+        let middle = Vec2::new((pixel % width) as f32 + 0.5, (pixel / width) as f32 + 0.5);
+        let ray = map.camera.ray(middle).as_dvec3();
+        let depth = plane.and_then(|plane| all_planes[plane].depth(ray));
+        let depth = depth.filter(|depth| range.contains(depth));
+        map.depth[pixel] = depth.unwrap_or_default() as f32;
+    }
+    map
+}
+
+/// Returns the label at the centre of each pixel of a smaller camera.
+fn shrunk_labels(camera: &Camera, labels: &LabelMap) -> Vec<u16> {
+    let at = |x: u32, y: u32| {
+        let full = |at: u32, side: u32, full: u32| (2 * at + 1) * full / (2 * side);
+        labels.at(
+            full(x, camera.width, labels.width),
+            full(y, camera.height, labels.height),
+        )
+    };
+    let pixels = (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
+    pixels.map(|(x, y)| at(x, y)).collect()
+}
+
+/// Spreads the values of seeds over the pixels of their labels, in the order of distance. Returns
+/// the value of each pixel.
+fn spread(labels: &[u16], width: usize, seeds: &[(usize, Option<usize>)]) -> Vec<Option<usize>> {
+    let mut values: Vec<Option<Option<usize>>> = vec![None; labels.len()];
+    let mut queue = VecDeque::new();
+    for (pixel, value) in seeds {
+        if values[*pixel].is_none() {
+            values[*pixel] = Some(*value);
+            queue.push_back(*pixel);
+        }
+    }
+    while let Some(pixel) = queue.pop_front() {
+        let x = pixel % width;
+        let neighbours = [
+            (x > 0).then(|| pixel - 1),
+            (x + 1 < width).then_some(pixel + 1),
+            pixel.checked_sub(width),
+            Some(pixel + width).filter(|below| *below < labels.len()),
+        ];
+        for next in neighbours.into_iter().flatten() {
+            if values[next].is_none() && labels[next] == labels[pixel] {
+                values[next] = values[pixel];
+                queue.push_back(next);
+            }
+        }
+    }
+    values.into_iter().map(Option::flatten).collect()
+}
+
+/// Returns the range of depths that planes of a view may have.
+fn depth_range(mut depths: Vec<f64>) -> Option<std::ops::Range<f64>> {
+    depths.sort_by(f64::total_cmp);
+    let last = depths.len().checked_sub(1)?;
+    let cut = (OUTLIERS * last as f64) as usize;
+    Some(depths[cut] / RANGE_FACTOR..depths[last - cut] * RANGE_FACTOR)
+}
+
+/// A plane n P = 1 in camera space. The residual of a point, |n P - 1|, is its relative depth
+/// error.
+struct Plane {
+    n: DVec3,
+    /// Covariance of `n`.
+    covariance: DMat3,
+}
+
+impl Plane {
+    /// Fits planes to points one after another, each to the points that the earlier ones left.
+    /// Returns the planes, and the index of each point's plane. The first `own` points are those
+    /// that the view itself sees.
+    fn fit_all(points: &[DVec3], own: usize, rng: &mut Rng) -> (Vec<Self>, Vec<Option<usize>>) {
+        let mut planes = Vec::new();
+        let mut plane_of_point = vec![None; points.len()];
+        let mut left: Vec<usize> = (0..points.len()).collect();
+        loop {
+            let positions: Vec<DVec3> = left.iter().map(|k| points[*k]).collect();
+            let own_left = left.iter().filter(|k| **k < own).count();
+            let Some(plane) = Self::fit(&positions, own_left, rng) else {
+                return (planes, plane_of_point);
+            };
+            for k in &left {
+                if plane.error(points[*k]) < TOLERANCE {
+                    plane_of_point[*k] = Some(planes.len());
+                }
+            }
+            left.retain(|k| plane_of_point[*k].is_none());
+            planes.push(plane);
+        }
+    }
+
+    /// Returns the relative depth error of a point on the plane.
+    fn error(&self, point: DVec3) -> f64 {
+        (self.n.dot(point) - 1.0).abs()
+    }
+
+    /// Fits a plane to points in camera space by RANSAC; `None` if fewer than [`MIN_INLIERS`] of
+    /// them lie on any plane.
+    fn fit(points: &[DVec3], own: usize, rng: &mut Rng) -> Option<Self> {
+        if points.len() < MIN_POINTS || own < MIN_OWN_POINTS {
+            return None;
+        }
+        let inliers = |n: DVec3| {
+            points
+                .iter()
+                .filter(move |p| (n.dot(**p) - 1.0).abs() < TOLERANCE)
+        };
+        let own_points = &points[..own];
+        let own_inliers = |n: DVec3| {
+            let is_near = |p: &&DVec3| (n.dot(**p) - 1.0).abs() < TOLERANCE;
+            own_points.iter().filter(is_near).count()
+        };
+        let mut best = (0, DVec3::ZERO);
+        for _ in 0..TRIALS {
+            let [a, b, c] = [(); 3].map(|()| points[rng.below(points.len())]);
+            let rows = DMat3::from_cols(a, b, c).transpose();
+            let volume = rows.determinant().abs();
+            if volume < 1e-6 * a.length() * b.length() * c.length() {
+                continue;
+            }
+            let n = rows.inverse() * DVec3::ONE;
+            let count = inliers(n).count();
+            if count > best.0 && own_inliers(n) >= MIN_OWN_POINTS {
+                best = (count, n);
+            }
+        }
+        let mut n = best.1;
+        let mut inverse = DMat3::ZERO;
+        for _ in 0..REFINEMENTS {
+            let outer = |p: &DVec3| DMat3::from_cols(*p * p.x, *p * p.y, *p * p.z);
+            let squares = inliers(n).map(outer).fold(DMat3::ZERO, |sum, m| sum + m);
+            if squares.determinant() <= 0.0 {
+                return None;
+            }
+            inverse = squares.inverse();
+            n = inverse * inliers(n).copied().sum::<DVec3>();
+        }
+        let count = inliers(n).count();
+        let own_count = own_inliers(n);
+        let is_supported =
+            own_count >= MIN_OWN_POINTS && own_count as f64 >= MIN_INLIERS * own as f64;
+        if count < MIN_POINTS || !is_supported {
+            return None;
+        }
+        let squares: f64 = inliers(n).map(|p| (n.dot(*p) - 1.0).powi(2)).sum();
+        Some(Self {
+            n,
+            covariance: inverse * (squares / count as f64),
+        })
+    }
+
+    /// Returns the depth along a ray with z = 1; `None` behind the camera, or where the points
+    /// leave it uncertain.
+    fn depth(&self, ray: DVec3) -> Option<f64> {
+        let depth = 1.0 / self.n.dot(ray);
+        let deviation = depth * ray.dot(self.covariance * ray).max(0.0).sqrt();
+        (depth > 0.0 && depth.is_finite() && deviation < TOLERANCE).then_some(depth)
+    }
+}
