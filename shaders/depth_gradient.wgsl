@@ -2,7 +2,8 @@
 // m1 = sum w ln z, m2 = sum w (ln z)^2 and m0 = sum w: docs/how-it-works.md, 5.7.
 //
 // frame    [8][padded rows][quads]  channels 3 to 5 hold m1, m2 and m0
-// targets  [3][padded rows][quads]  plane 2 holds the bits of the depth; 0 is unknown
+// targets  [3][padded rows][quads]  plane 2 holds the bits of the depth: 0 is unknown, and
+//                                   pixels with a negative one are ignored
 // gradient [6][padded rows][quads]  channels 3 to 5 receive dL/d m1, dL/d m2 and dL/d m0
 #import flat
 
@@ -47,7 +48,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let u = select(mean, log(select(vec4<f32>(1.0), depth, known)), known);
     let squares = max(m2 - 2.0 * u * m1 + u * u * m0, vec4<f32>(0.0));
     let inside = columns < vec4<u32>(loss.size.x) & vec4<bool>(row < loss.size.y);
-    let counts = inside & m0 >= vec4<f32>(MIN_OPACITY);
+    let counts = inside & m0 >= vec4<f32>(MIN_OPACITY) & depth >= vec4<f32>(0.0);
     let weight = select(vec4<f32>(0.0), vec4<f32>(loss.scale), counts);
     let by_m2 = 0.5 * weight / sqrt(squares + SOFTNESS * SOFTNESS);
     gradient[3u * plane + place] = -2.0 * u * by_m2;

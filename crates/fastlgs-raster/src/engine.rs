@@ -111,8 +111,8 @@ pub struct TargetImage {
     /// [`pack`]ed features (0 to 255 for 0 to 1), row by row; may be empty if features are not
     /// trained.
     pub feature: Vec<u32>,
-    /// Depth of the surface, row by row, in units of the scene; 0 where it is unknown. May be empty
-    /// if no step has a depth loss.
+    /// Depth of the surface, row by row, in units of the scene: 0 where it is unknown, negative
+    /// where the depth loss ignores the pixel. May be empty if no step has a depth loss.
     pub depth: Vec<f32>,
 }
 

@@ -233,7 +233,7 @@ impl TrainerConfig {
 
     /// Returns whether a step has a depth loss.
     pub(crate) fn trains_depth(&self, iteration: u32) -> bool {
-        self.depth_weight > 0.0 && self.channels.color() && iteration % DEPTH_EVERY == 0
+        self.depth_weight > 0.0 && self.channels.color() && iteration.is_multiple_of(DEPTH_EVERY)
     }
 
     /// Returns whether the scene may still grow.

@@ -204,13 +204,18 @@ impl Targets {
         })
     }
 
-    /// Returns the views with these depths; see [`TargetImage::depth`].
-    pub fn with_depths(self, depths: impl Fn(usize) -> Vec<f32> + Send + Sync + 'static) -> Self {
+    /// Returns the views with the depths that `depths` returns for a view and its image; see
+    /// [`TargetImage::depth`].
+    pub fn with_depths(
+        self,
+        depths: impl Fn(usize, &TargetImage) -> Vec<f32> + Send + Sync + 'static,
+    ) -> Self {
         let read = self.read;
         Self::new(self.cameras, self.gains, move |id| {
+            let image = read(id)?;
             Ok(TargetImage {
-                depth: depths(id),
-                ..read(id)?
+                depth: depths(id, &image),
+                ..image
             })
         })
     }

@@ -24,7 +24,8 @@ pub fn depth_gradient(loss: &DepthLoss, frame: &[f32], targets: &[u32], gradient
 }
 
 /// Returns the gradient of one pixel with the weight `scale` by its moments `[m1, m2, m0]`. `depth`
-/// is the target, or 0 if it is unknown. Symbols are those of docs/how-it-works.md, 5.7.
+/// is the target: 0 if it is unknown, negative if the loss ignores the pixel. Symbols are those of
+/// docs/how-it-works.md, 5.7.
 #[inline(always)]
 pub(crate) fn depth_gradient_at([m1, m2, m0]: [f32; 3], depth: f32, scale: f32) -> [f32; 3] {
     let u = if depth > 0.0 {
@@ -33,16 +34,8 @@ pub(crate) fn depth_gradient_at([m1, m2, m0]: [f32; 3], depth: f32, scale: f32) 
         m1 / m0.max(MIN_OPACITY)
     };
     let squares = (m2 - 2.0 * u * m1 + u * u * m0).max(0.0);
-    let gw = *GW;
-    let scale = if depth > 0.0 { scale } else { scale * gw };
-    let weight = if m0 >= MIN_OPACITY { scale } else { 0.0 };
+    let counts = m0 >= MIN_OPACITY && depth >= 0.0;
+    let weight = if counts { scale } else { 0.0 };
     let by_m2 = 0.5 * weight / (squares + SOFTNESS * SOFTNESS).sqrt();
     [-2.0 * u * by_m2, by_m2, u * u * by_m2]
 }
-
-static GW: std::sync::LazyLock<f32> = std::sync::LazyLock::new(|| {
-    std::env::var("GW")
-        .ok()
-        .and_then(|v| v.parse().ok())
-        .unwrap_or(1.0)
-});

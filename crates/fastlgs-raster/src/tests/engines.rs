@@ -12,7 +12,6 @@ fn options(channels: Channels) -> StepOptions {
     let exposure = Exposure {
         gain: [1.1, 0.9, 1.0],
         offset: [0.02, 0.0, -0.03],
-        depth_weight: 0.0,
     };
     StepOptions {
         channels,

@@ -3,10 +3,12 @@
 
 use super::{camera, gpu_in_each_shape};
 use crate::density::State;
+use crate::view::DEPTH_MOMENTS;
 use crate::{
     Channels, CpuEngine, Engine, Exposure, GpuEngine, Step, StepOptions, TargetImage, View, pack,
 };
 use fastlgs_core::Gaussians;
+use fastlgs_core::gaussians::channel::FEATURE;
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of, rest_len};
 use fastlgs_core::rng::Rng;
 use glam::{DMat3, DMat4, DQuat, DVec2, DVec3, Vec3};
@@ -81,13 +83,18 @@ fn render(view: &View, params: &[f64], around: &Surroundings) -> Vec<f64> {
             {
                 color += basis * vec3(17 + 3 * k, i);
             }
+            let [x, y, z] = if view.depth_as_feature == DEPTH_MOMENTS {
+                [t.z.ln(), t.z.ln().powi(2), 1.0]
+            } else {
+                [at(14, i), at(15, i), at(16, i)]
+            };
             let values = [
                 color.x.max(0.0),
                 color.y.max(0.0),
                 color.z.max(0.0),
-                at(14, i),
-                at(15, i),
-                at(16, i),
+                x,
+                y,
+                z,
             ];
             let left_out =
                 crate::cpu::pcg3d(glam::UVec3::new(i as u32, view.draw, 2)).x < view.dropped;
@@ -168,6 +175,30 @@ fn harmonics(d: DVec3) -> [f64; 15] {
 /// Returns (1 - lambda) L1 + lambda (1 - SSIM) of colour, plus the same of the feature times its
 /// weight.
 fn loss(planes: &[f64], target: &[f64], around: &Surroundings) -> f64 {
+    loss_of(0..6, planes, target, around)
+}
+
+/// Returns the mean over the pixels of the depth loss; docs/how-it-works.md, 5.7.
+fn depth_loss(planes: &[f64], depth: &[f32]) -> f64 {
+    let n = depth.len();
+    let of_pixel = |(pixel, depth): (usize, &f32)| {
+        let [m1, m2, m0] = [3, 4, 5].map(|channel| planes[channel * n + pixel]);
+        let depth = f64::from(*depth);
+        let u = if depth > 0.0 { depth.ln() } else { m1 / m0 };
+        let squares = m2 - 2.0 * u * m1 + u * u * m0;
+        let counts = f64::from(u8::from(depth >= 0.0));
+        counts * (squares + 0.01f64.powi(2)).sqrt()
+    };
+    depth.iter().enumerate().map(of_pixel).sum::<f64>() / n as f64
+}
+
+/// Returns the loss of these channels.
+fn loss_of(
+    channels: std::ops::Range<usize>,
+    planes: &[f64],
+    target: &[f64],
+    around: &Surroundings,
+) -> f64 {
     let (w, h) = SIZE;
     let n = w * h;
     let taps: Vec<f64> = (-5i32..=5)
@@ -186,7 +217,7 @@ fn loss(planes: &[f64], target: &[f64], around: &Surroundings) -> f64 {
         }
         sum
     };
-    (0..6)
+    channels
         .map(|c| {
             let x = |p: usize| {
                 if c < 3 {
@@ -367,6 +398,79 @@ fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
     }
 }
 
+/// Checks the gradients of a step with a depth loss. Of three neighbouring pixels, one has a known
+/// depth, one an unknown one, and the loss ignores one.
+fn check_depth(engine: &mut dyn Engine) {
+    const WEIGHT: f64 = 0.4;
+    let scene = scene(1);
+    let n = scene.len();
+    let around = Surroundings {
+        background: [0.1, 0.3, 0.2, 0.0, 0.0, 0.0],
+        gain: [1.0; 3],
+        offset: [0.0; 3],
+    };
+    let view = View::new(&camera(SIZE.0 as u32, SIZE.1 as u32), n, 1)
+        .with_background([0.1, 0.3, 0.2])
+        .with_depth_moments();
+    let pixels = SIZE.0 * SIZE.1;
+    let depth: Vec<f32> = (0..pixels)
+        .map(|pixel| [3.0 + 0.01 * pixel as f32, 0.0, -1.0][pixel % 3])
+        .collect();
+    let target = TargetImage {
+        size: view.size,
+        color: vec![pack([90, 120, 150], true); pixels],
+        feature: Vec::new(),
+        depth: depth.clone(),
+    };
+    let colors = [90.0, 120.0, 150.0].map(|value: f64| vec![value / 255.0; pixels]);
+    let colors = colors.concat();
+    engine.set_state(&State::of(&scene)).unwrap();
+    engine.set_target(0, target.clone()).unwrap();
+    let options = StepOptions {
+        channels: Channels::Coupled,
+        lambda: LAMBDA as f32,
+        feature_weight: 0.0,
+        exposure: Exposure::default(),
+        depth_weight: WEIGHT as f32,
+    };
+    let step = Step::new(1, 0..FEATURE.start, &[0.0; BASE_CHANNELS + 1]);
+    engine.step(view, 0, &options, &step).unwrap();
+    let gradients = engine.gradients().unwrap();
+    let params: Vec<f64> = scene.to_channels().into_iter().map(f64::from).collect();
+    let loss = |params: &[f64]| {
+        let planes = render(&view, params, &around);
+        loss_of(0..3, &planes, &colors, &around) + WEIGHT * depth_loss(&planes, &depth)
+    };
+    for c in 0..channels_of(1) {
+        let of_channel = &gradients[c * n..(c + 1) * n];
+        let largest = of_channel.iter().fold(0.0f32, |m, g| m.max(g.abs()));
+        for k in c * n..(c + 1) * n {
+            let moved = |delta: f64| {
+                let mut params = params.clone();
+                params[k] += delta;
+                loss(&params)
+            };
+            let difference = (moved(1e-5) - moved(-1e-5)) / 2e-5;
+            let (found, allowed) = (f64::from(gradients[k]), 2e-3 * f64::from(largest) + 1e-6);
+            assert!(
+                (difference - found).abs() <= allowed,
+                "channel {c} of Gaussian {}: {found} against {difference} ({})",
+                k - c * n,
+                engine.name()
+            );
+        }
+    }
+    let stats = engine.stats().unwrap();
+    assert!(stats.iter().all(|v| *v == 0.0), "no colour gradient counts");
+    let without = TargetImage {
+        depth: Vec::new(),
+        ..target
+    };
+    engine.set_target(0, without).unwrap();
+    let refused = engine.step(view, 0, &options, &step).unwrap_err();
+    assert!(refused.to_string().contains("depth"), "{refused}");
+}
+
 /// Checks a Gaussian whose opacity reaches its limit only by the gain of DropGaussian. A loss that
 /// asks for more opacity must give the gradient 0.
 fn check_limit(engine: &mut dyn Engine) {
@@ -414,6 +518,7 @@ fn check_limit(engine: &mut dyn Engine) {
 #[test]
 fn on_the_cpu() {
     check_limit(&mut CpuEngine::new());
+    check_depth(&mut CpuEngine::new());
     for (sh_degree, antialias) in [(0, 0), (1, 1), (2, 0), (3, 1)] {
         check(&mut CpuEngine::new(), sh_degree, antialias);
     }
@@ -424,6 +529,7 @@ fn on_the_gpu() {
     for gpu in gpu_in_each_shape() {
         let mut engine = GpuEngine::new(gpu);
         check_limit(&mut engine);
+        check_depth(&mut engine);
         for (sh_degree, antialias) in [(0, 1), (1, 0), (2, 1), (3, 0)] {
             check(&mut engine, sh_degree, antialias);
         }

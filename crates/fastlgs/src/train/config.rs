@@ -150,6 +150,9 @@ const OFFLINE_THETA: f32 = 0.7;
 /// weight lowers it by 0.1 dB.
 const FEATURE_WEIGHT: f32 = 0.2;
 
+/// Default weight of the depth loss, an error of ln depth, relative to the colour loss.
+const DEPTH_WEIGHT: f32 = 0.3;
+
 /// Least number of training pixels per Gaussian of an automatic budget. A Gaussian has 14
 /// parameters and a pixel has three values. With fewer pixels, Gaussians overfit the photos.
 const MIN_PIXELS_PER_GAUSSIAN: usize = 20;
@@ -263,6 +266,10 @@ pub struct TrainConfig {
     /// --borders. Both losses move Gaussians, unless --freeze is set.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = FEATURE_WEIGHT))]
     pub feature_weight: f32,
+    /// Weight of the depth loss, which keeps Gaussians on surfaces where photos have no texture; 0
+    /// for none.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = DEPTH_WEIGHT))]
+    pub depth_weight: f32,
     /// Continue from the last checkpoint.
     #[cfg_attr(feature = "clap", arg(long))]
     pub resume: bool,
@@ -293,6 +300,7 @@ impl Default for TrainConfig {
             support: objects.min_support,
             curve: None,
             feature_weight: FEATURE_WEIGHT,
+            depth_weight: DEPTH_WEIGHT,
             resume: false,
         }
     }
@@ -322,6 +330,7 @@ impl TrainConfig {
                 exposure: off_if_auto(self.exposure),
                 align: off_if_auto(self.align),
                 budget: Some(self.budget.unwrap_or(self.preset.values().2)),
+                depth_weight: 0.0,
                 ..self.clone()
             },
             _ => self.clone(),

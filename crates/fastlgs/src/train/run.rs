@@ -5,9 +5,7 @@ use crate::progress::{Message, TrainStep};
 use crate::train::settings::settings;
 use crate::{Result, Run, checkpoints, objects, stop_point, transparent};
 use fastlgs_core::{Camera, Gaussians};
-use fastlgs_raster::{
-    Choice, Engine, FreeSpace, Progress, Targets, Trainer, TrainerConfig, TrainerReport,
-};
+use fastlgs_raster::{Choice, Engine, Progress, Targets, Trainer, TrainerConfig, TrainerReport};
 use fastlgs_sfm::surfaces::Surfaces;
 use std::time::Instant;
 
@@ -41,20 +39,8 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
     held_out.check()?;
     let device = fastlgs_raster::choice(run.device);
     let mut engine = fastlgs_raster::open_engine(&device.device)?;
-    let surfaces = if config.init.is_none() && !std::env::var("NO_SURF").is_ok() {
-        Some(init::surfaces(folder, &inputs.training)?)
-    } else {
-        None
-    };
+    let surfaces = init::surfaces(config, folder, &inputs.training)?;
     let first = initial_gaussians(inputs, &targets, surfaces.as_ref(), &mut *engine, run)?;
-    let before_surfaces = surfaces.as_ref().map(|surfaces| {
-        let maps = surfaces.maps.iter();
-        FreeSpace::before_surfaces(maps.map(|map| (&map.camera, map.depth.as_slice())))
-    });
-    let targets = match surfaces {
-        Some(surfaces) => init::with_depths(targets, surfaces.maps),
-        None => targets,
-    };
     let kept_transparent = match config.mapping {
         Mapping::Keep => transparent::take_transparent(&mut folder.gaussians()?),
         Mapping::Paper | Mapping::Global => Gaussians::default(),
@@ -62,14 +48,14 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
     let brightness = inputs.notes.brightness.clone().unwrap_or_default();
     let manifest = &inputs.manifest;
     let settings = settings(config, &first, &targets, manifest, &brightness, run.seed);
-    let free = init::free_space(config, folder, &inputs.training, &first)?;
+    let free = init::free_space(config, folder, &inputs.training, &first, surfaces.as_ref())?;
+    let targets = match surfaces {
+        Some(surfaces) => init::with_depths(targets, surfaces.maps),
+        None => targets,
+    };
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
-    if let (Some(before), true) = (before_surfaces, std::env::var("FS").is_ok()) {
-        trainer.set_free_space(before);
-    } else {
-        trainer.set_free_space(free);
-    }
+    trainer.set_free_space(free);
     resume(&mut trainer, inputs, run)?;
     run.progress.on_message(Message::TrainingBegins(&first));
     let mut watch = ProgressWatcher {

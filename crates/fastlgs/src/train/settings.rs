@@ -38,10 +38,7 @@ pub fn settings(
         }),
         first_degree: first.sh_degree,
         feature_weight: config.feature_weight,
-        depth_weight: std::env::var("DW")
-            .ok()
-            .and_then(|v| v.parse().ok())
-            .unwrap_or(0.0),
+        depth_weight: config.depth_weight,
         couples_at: config
             .masks_guide_training(&manifest.segmenter)
             .then(|| mask_supervision::begin_at(config.iterations())),
