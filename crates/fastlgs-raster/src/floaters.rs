@@ -9,9 +9,10 @@
 //! * Space around a camera is free as well, within a similar radius. Otherwise a haze in the colour
 //!   of a wall can hide the scene from a view between two cameras.
 //!
-//! With many photos no space is free, because other photos contradict floaters. Free space would
-//! then do harm: some camera is near to each object, and photos agree on the wall behind a thin
-//! object.
+//! With many photos, other photos contradict floaters, and these rules would do harm: some camera is
+//! near to each object, and photos agree on the wall behind a thin object. Only the space before
+//! surfaces is then free. A surface covers the pixels of its mask alone, and thus none of what stands
+//! before it.
 
 use fastlgs_core::Camera;
 use fastlgs_core::dataset::SfmPoint;
@@ -313,6 +314,28 @@ mod tests {
             far.contains(at(100.0, 3.0)),
             "the nearer point is too far beside it"
         );
+    }
+
+    #[test]
+    fn space_before_surfaces_of_two_cameras_is_free() {
+        let cameras = [camera(0.0), camera(1.0), camera(-1.0)];
+        let pixels = (cameras[0].width * cameras[0].height) as usize;
+        let depths = [4.0, 4.0, 0.0].map(|depth| vec![depth; pixels]);
+        let free = |views: std::ops::Range<usize>| {
+            let maps = cameras[views.clone()].iter().zip(&depths[views]);
+            let maps = maps.map(|(camera, depth)| (camera, depth.as_slice()));
+            FreeSpace::before_surfaces(maps)
+        };
+        let both = free(0..3);
+        assert!(both.contains(-Vec3::Z), "before both surfaces");
+        assert!(!both.contains(-0.2 * Vec3::Z), "on the surfaces");
+        assert!(!both.contains(-4.0 * Vec3::Z), "at a camera");
+        assert!(!free(0..1).contains(-Vec3::Z), "one camera is not enough");
+        assert!(
+            !free(1..3).contains(-Vec3::Z),
+            "an unknown surface does not count"
+        );
+        assert!(!FreeSpace::default().contains(-Vec3::Z));
     }
 
     #[test]

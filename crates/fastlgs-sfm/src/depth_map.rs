@@ -79,3 +79,45 @@ impl DepthMap {
         pixels.map(|(x, y)| depth(x, y)).collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_resized_plane_is_exact_and_edges_are_unknown() {
+        let wide = Camera::look_at("a", Vec3::ZERO, Vec3::Z, Vec3::NEG_Y, 40, 20, 0.8);
+        let normal = Vec3::new(0.2, -0.1, -1.0);
+        let plane = |camera: &Camera, x: u32, y: u32| {
+            let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
+            -3.0 / normal.dot(ray)
+        };
+        let small = wide.shrunk_to(10);
+        let mut map = DepthMap::empty(small.clone());
+        for y in 0..5 {
+            for x in 0..10 {
+                map.depth[(y * 10 + x) as usize] = plane(&small, x, y);
+            }
+        }
+        let depth = map.resized(40, 20);
+        // Half a pixel of the small map along the border is not between four neighbours.
+        for y in 2..18 {
+            for x in 2..38 {
+                let (found, exact) = (depth[(y * 40 + x) as usize], plane(&wide, x, y));
+                assert!((found / exact - 1.0).abs() < 1e-4, "{found} and {exact}");
+            }
+        }
+        map.depth[24] = 9.0;
+        map.depth[0] = 0.0;
+        let depth = map.resized(40, 20);
+        assert_eq!(depth[10 * 40 + 17], 0.0, "a depth step");
+        assert_eq!(depth[0], 0.0, "an unknown pixel");
+        map.add(map.point(24) * 0.5);
+        assert!(
+            (map.depth[24] - 4.5).abs() < 1e-3,
+            "the nearer point is kept"
+        );
+        map.add(map.point(24) * 3.0);
+        assert!((map.depth[24] - 4.5).abs() < 1e-3);
+    }
+}

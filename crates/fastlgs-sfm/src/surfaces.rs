@@ -451,3 +451,115 @@ impl Plane {
         (depth > 0.0 && depth.is_finite() && deviation < TOLERANCE).then_some(depth)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Corner of a room: the wall z = 4 where x < 1, and the wall x = 1 where z < 4.
+    fn walls() -> impl Iterator<Item = Vec3> {
+        let grid = |from: f32, to: f32| (0..12).map(move |k| from + (to - from) * k as f32 / 11.0);
+        let back = grid(-1.5, 1.0).flat_map(move |x| grid(-1.0, 1.0).map(move |y| (x, y)));
+        let side = grid(2.0, 4.0).flat_map(move |z| grid(-1.0, 1.0).map(move |y| (z, y)));
+        let back = back.map(|(x, y)| Vec3::new(x, y, 4.0));
+        back.chain(side.map(|(z, y)| Vec3::new(1.0, y, z)))
+    }
+
+    fn true_depth(camera: &Camera, pixel: usize) -> f32 {
+        let width = camera.width as usize;
+        let middle = Vec2::new((pixel % width) as f32 + 0.5, (pixel / width) as f32 + 0.5);
+        let inverse = camera.world_to_camera.inverse();
+        let ray = inverse.transform_vector3(camera.ray(middle));
+        let eye = camera.centre();
+        let back = (4.0 - eye.z) / ray.z;
+        let side = (1.0 - eye.x) / ray.x;
+        if side > 0.0 { back.min(side) } else { back }
+    }
+
+    fn cameras() -> Vec<Camera> {
+        let camera = |k: usize| {
+            let eye = Vec3::new(-0.3 + 0.2 * k as f32, 0.0, 0.0);
+            let target = Vec3::new(0.3, 0.0, 4.0);
+            Camera::look_at(&k.to_string(), eye, target, Vec3::Y, 256, 192, 0.6)
+        };
+        (0..4).map(camera).collect()
+    }
+
+    fn points(seen_by: &[u32]) -> Vec<SfmPoint> {
+        let point = |position: Vec3| SfmPoint {
+            position,
+            color: [0; 3],
+            seen_by: seen_by.to_vec(),
+        };
+        walls().map(point).collect()
+    }
+
+    fn one_mask() -> LabelMap {
+        let mut map = LabelMap::new(256, 192);
+        map.labels.fill(1);
+        map
+    }
+
+    #[test]
+    fn two_walls_of_one_mask() {
+        let cameras = cameras();
+        // The last camera shares few points with the others.
+        let mut points = points(&[0, 1, 2]);
+        points
+            .iter_mut()
+            .step_by(20)
+            .for_each(|p| p.seen_by.push(3));
+        let surfaces = Surfaces::new(&cameras, &points, |_| Ok::<_, ()>(one_mask())).unwrap();
+        for map in &surfaces.maps {
+            let known: Vec<usize> = (0..map.depth.len())
+                .filter(|p| map.depth[*p] > 0.0)
+                .collect();
+            assert!(known.len() * 10 > map.depth.len() * 6, "{}", known.len());
+            let is_near =
+                |p: &&usize| (map.depth[**p] / true_depth(&map.camera, **p) - 1.0).abs() < 0.02;
+            let right = known.iter().filter(is_near).count();
+            assert!(
+                right * 100 >= known.len() * 97,
+                "{right} of {}",
+                known.len()
+            );
+        }
+        let new = surfaces.new_points(|view, place| {
+            assert!(place.x > 0.0 && place.x < 1.0 && place.y > 0.0 && place.y < 1.0);
+            [view as u8; 3]
+        });
+        assert!(new.len() > 300, "{}", new.len());
+        let of_first = new.iter().filter(|p| p.color == [0; 3]).count();
+        assert!(
+            of_first * 2 > new.len(),
+            "views do not repeat each other's points"
+        );
+    }
+
+    #[test]
+    fn a_plane_that_no_other_view_confirms_is_dropped() {
+        let cameras = cameras();
+        let known = |points: &[SfmPoint]| {
+            let surfaces = Surfaces::new(&cameras, points, |_| Ok::<_, ()>(one_mask())).unwrap();
+            let known = |map: &DepthMap| map.depth.iter().filter(|d| **d > 0.0).count();
+            surfaces.maps.iter().map(known).sum::<usize>()
+        };
+        assert_eq!(known(&points(&[1])), 0, "one view alone");
+        assert!(known(&points(&[1, 2])) > 0, "two views");
+        assert_eq!(known(&[]), 0, "no points");
+        let without_masks = |_| Ok::<_, ()>(LabelMap::new(256, 192));
+        let bare = Surfaces::new(&cameras, &points(&[0, 1, 2]), without_masks).unwrap();
+        assert!(
+            bare.maps
+                .iter()
+                .all(|map| map.depth.iter().all(|d| *d == 0.0))
+        );
+    }
+
+    #[test]
+    fn values_spread_within_their_label() {
+        let labels = [1, 1, 2, 1, 1, 1];
+        let spread = spread(&labels, 6, &[(0, Some(5)), (2, None), (5, Some(7))]);
+        assert_eq!(spread, [Some(5), Some(5), None, Some(7), Some(7), Some(7)]);
+    }
+}

@@ -120,6 +120,11 @@ class TrainOptions(TypedDict, total=False):
     # rounded up to a multiple of 20
     curve: int
 
+    # Weight of the depth loss, which keeps Gaussians on surfaces where photos have no texture;
+    # 0 for none. It is multiplied by the square of the share of the photos without texture. 1.5
+    # suits rooms with bare walls
+    depth_weight: float
+
     # Learn an affine exposure for each training photo. `auto` does so if the photos' brightness
     # varies
     exposure: Literal["auto", "on", "off"]
@@ -208,6 +213,14 @@ class EvaluateOptions(TypedDict, total=False):
 
     # CLIP text tower, for scenes with imported embeddings, or if its file has moved
     clip_text: Path
+
+    # Folder of true depth maps of held-out views, named as their photos: grey PNG of 16 bits,
+    # or EXR in world units. 0 means unknown
+    depth: Path
+
+    # Depth in world units of one step of the PNG files of --depth. The default suits
+    # millimetres in a scene in metres
+    depth_unit: float
 
     # Accepted share of absent names that are answered, 0 to 1
     false_alarms: float

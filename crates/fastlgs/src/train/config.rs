@@ -150,8 +150,9 @@ const OFFLINE_THETA: f32 = 0.7;
 /// weight lowers it by 0.1 dB.
 const FEATURE_WEIGHT: f32 = 0.2;
 
-/// Default weight of the depth loss, an error of ln depth, relative to the colour loss.
-const DEPTH_WEIGHT: f32 = 0.3;
+/// Default weight of the depth loss, an error of ln depth, relative to the colour loss. It is off,
+/// because it lowers the PSNR of photos with texture (docs/research/rooms.md).
+const DEPTH_WEIGHT: f32 = 0.0;
 
 /// Least number of training pixels per Gaussian of an automatic budget. A Gaussian has 14
 /// parameters and a pixel has three values. With fewer pixels, Gaussians overfit the photos.
@@ -267,7 +268,8 @@ pub struct TrainConfig {
     #[cfg_attr(feature = "clap", arg(long, default_value_t = FEATURE_WEIGHT))]
     pub feature_weight: f32,
     /// Weight of the depth loss, which keeps Gaussians on surfaces where photos have no texture; 0
-    /// for none.
+    /// for none. It is multiplied by the square of the share of the photos without texture. 1.5
+    /// suits rooms with bare walls.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = DEPTH_WEIGHT))]
     pub depth_weight: f32,
     /// Continue from the last checkpoint.

@@ -108,73 +108,26 @@ fn surface_points(surfaces: &Surfaces, views: &Targets) -> Result<Vec<SfmPoint>>
     }))
 }
 
-/// Returns the targets with the depths of surfaces, one map for each view.
+/// Returns the targets with the depths of surfaces, one map for each view. The depth loss ignores the
+/// pixels that the colour loss ignores.
 pub fn with_depths(targets: Targets, maps: Vec<DepthMap>) -> Targets {
-    let sizes: Vec<[u32; 2]> = targets
-        .cameras
-        .iter()
-        .map(|camera| [camera.width, camera.height])
-        .collect();
     targets.with_depths(move |id, image| {
-        let mut depth = maps[id].resized(sizes[id][0], sizes[id][1]);
-        let textured = textured(image).into_iter().zip(&mut depth);
-        textured
-            .filter(|(textured, _)| *textured)
-            .for_each(|(_, depth)| *depth = NO_DEPTH_LOSS);
+        let mut depth = maps[id].resized(image.size[0], image.size[1]);
+        let ignored = image
+            .color
+            .iter()
+            .map(|pixel| pixel.to_le_bytes()[3] != 255);
+        depth
+            .iter_mut()
+            .zip(ignored)
+            .filter(|(_, ignored)| *ignored)
+            .for_each(|(depth, _)| *depth = NO_DEPTH_LOSS);
         depth
     })
 }
 
 /// Depth of pixels that the depth loss ignores.
 const NO_DEPTH_LOSS: f32 = -1.0;
-/// Number of cells along the longer side of an image, in which texture is measured.
-const TEXTURE_CELLS: usize = 128;
-/// Standard deviation of grey values (0 to 255) from which an image has texture. Plane sweep stereo
-/// has the same limit.
-const MIN_TEXTURE: f32 = 3.0;
-
-/// Returns for each pixel whether the image has texture in its cell and the eight cells around it.
-/// There, photos determine depth better than planes do.
-fn textured(image: &TargetImage) -> Vec<bool> {
-    let [width, height] = image.size.map(|side| side as usize);
-    let side = width.max(height).div_ceil(TEXTURE_CELLS);
-    let [columns, rows] = [width, height].map(|pixels| pixels.div_ceil(side));
-    let cell = |pixel: usize| pixel / width / side * columns + pixel % width / side;
-    // Number, sum and sum of squares of the grey values of each cell.
-    let mut sums = vec![[0.0f32; 3]; columns * rows];
-    for (pixel, color) in image.color.iter().enumerate() {
-        let grey = grey(*color);
-        let sums = sums[cell(pixel)].iter_mut();
-        sums.zip([1.0, grey, grey * grey])
-            .for_each(|(sum, value)| *sum += value);
-    }
-    let has_texture = |cell: usize| {
-        let (x, y) = (cell % columns, cell / columns);
-        let around = |at: usize, end: usize| at.saturating_sub(1)..(at + 2).min(end);
-        let mut total = [0.0f32; 3];
-        for y in around(y, rows) {
-            for x in around(x, columns) {
-                let cell = sums[y * columns + x];
-                total
-                    .iter_mut()
-                    .zip(cell)
-                    .for_each(|(sum, own)| *sum += own);
-            }
-        }
-        let [n, sum, squares] = total;
-        squares / n - (sum / n).powi(2) >= MIN_TEXTURE * MIN_TEXTURE
-    };
-    let has_texture: Vec<bool> = (0..sums.len()).map(has_texture).collect();
-    (0..image.color.len())
-        .map(|pixel| has_texture[cell(pixel)])
-        .collect()
-}
-
-/// Returns the grey value of a packed pixel, 0 to 255.
-fn grey(packed: u32) -> f32 {
-    let [r, g, b, _] = packed.to_le_bytes().map(f32::from);
-    0.299 * r + 0.587 * g + 0.114 * b
-}
 
 /// Number of training views that decide whether the axes of an imported file are flipped.
 const CHECKED_VIEWS: usize = 4;

@@ -8,6 +8,7 @@ mod mask_supervision;
 mod report;
 mod run;
 mod settings;
+mod texture;
 
 use crate::error::Context;
 use crate::output::SceneLock;

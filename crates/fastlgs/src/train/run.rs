@@ -1,6 +1,6 @@
 //! Trains the Gaussians of a scene.
 
-use super::{CurvePoint, Inputs, Mapping, init, mask_supervision};
+use super::{CurvePoint, Inputs, Mapping, init, mask_supervision, texture};
 use crate::progress::{Message, TrainStep};
 use crate::train::settings::settings;
 use crate::{Result, Run, checkpoints, objects, stop_point, transparent};
@@ -47,7 +47,11 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
     };
     let brightness = inputs.notes.brightness.clone().unwrap_or_default();
     let manifest = &inputs.manifest;
-    let settings = settings(config, &first, &targets, manifest, &brightness, run.seed);
+    let mut settings = settings(config, &first, &targets, manifest, &brightness, run.seed);
+    settings.depth_weight = match surfaces {
+        Some(_) => config.depth_weight * texture::bare_share(&targets)?.powi(2),
+        None => 0.0,
+    };
     let free = init::free_space(config, folder, &inputs.training, &first, surfaces.as_ref())?;
     let targets = match surfaces {
         Some(surfaces) => init::with_depths(targets, surfaces.maps),

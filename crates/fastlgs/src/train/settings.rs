@@ -38,7 +38,6 @@ pub fn settings(
         }),
         first_degree: first.sh_degree,
         feature_weight: config.feature_weight,
-        depth_weight: config.depth_weight,
         couples_at: config
             .masks_guide_training(&manifest.segmenter)
             .then(|| mask_supervision::begin_at(config.iterations())),
