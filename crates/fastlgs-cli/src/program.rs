@@ -5,7 +5,7 @@ use clap::{Arg, Command, CommandFactory};
 
 /// Options that the help of a command shows, besides the global ones. All others work as well; they
 /// are in `--config` files and in `docs/reference/commands.md`.
-const VISIBLE_OPTIONS: [(&str, &[&str]); 5] = [
+const VISIBLE_OPTIONS: [(&str, &[&str]); 6] = [
     (
         "make",
         &[
@@ -64,6 +64,17 @@ const VISIBLE_OPTIONS: [(&str, &[&str]); 5] = [
             "path",
             "size",
             "what",
+        ],
+    ),
+    (
+        "eval",
+        &[
+            "labels",
+            "false_alarms",
+            "absent",
+            "clip_text",
+            "depth",
+            "depth_unit",
         ],
     ),
 ];
