@@ -109,7 +109,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var feature = param3(FEATURE, i);
     if view.depth_as_feature == 1u {
         feature = vec3<f32>(t.z, 0.0, 0.0);
-    } else if view.depth_as_feature == 2u {
+    } else if view.depth_as_feature == DEPTH_MOMENTS {
         let log_z = log(t.z);
         feature = vec3<f32>(log_z, log_z * log_z, 1.0);
     }

@@ -118,7 +118,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 #endif
     }
     // Depth moments are no trained values.
-    let trains_depth = view.depth_as_feature == 2u;
+    let trains_depth = view.depth_as_feature == DEPTH_MOMENTS;
     put3(FEATURE, i, select(sum2.yzw, vec3<f32>(0.0), trains_depth));
 #ifdef WITH_COLOR
     let mean = param3(MEAN, i);

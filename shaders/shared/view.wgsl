@@ -40,6 +40,8 @@ struct View {
     unused1: u32,
 }
 
+// Value of depth_as_feature for the depth loss.
+const DEPTH_MOMENTS: u32 = 2u;
 // Tile edge in pixels. Images on the device are padded to whole tiles; the padding is zero.
 const TILE: u32 = 8u;
 // A Gaussian is not drawn where it would add less than one grey level (1 / 255).

@@ -116,6 +116,19 @@ impl Camera {
         )
     }
 
+    /// Returns the centre of a pixel, given by its row-major index.
+    pub fn pixel_centre(&self, pixel: usize) -> Vec2 {
+        let width = self.width as usize;
+        Vec2::new((pixel % width) as f32 + 0.5, (pixel / width) as f32 + 0.5)
+    }
+
+    /// Returns the scene coordinates of the point at a depth along the ray through a pixel's
+    /// centre. `pixel` is its row-major index.
+    pub fn point_at(&self, pixel: usize, depth: f32) -> Vec3 {
+        let place = self.ray(self.pixel_centre(pixel)) * depth;
+        self.world_to_camera.inverse().transform_point3(place)
+    }
+
     /// Creates a camera at `eye` that looks at `target`, with `up` towards the top of the image.
     /// `fov_y` is the vertical field of view in radians.
     pub fn look_at(

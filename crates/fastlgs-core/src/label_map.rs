@@ -92,11 +92,6 @@ impl LabelMap {
         )
     }
 
-    /// Combines two maps. Each pair (own label, other label) that occurs gets a number, from 0 in
-    /// ascending order. Also returns the pair of each number.
-    ///
-    /// # Panics
-    /// If the maps differ in size.
     /// Resizes the map with nearest-neighbour sampling.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let pick = |n: u32, from: u32, to: u32| {

@@ -1,7 +1,7 @@
 //! Depth maps of views.
 
 use fastlgs_core::Camera;
-use glam::{Vec2, Vec3};
+use glam::Vec3;
 
 /// Relative depth difference of neighbouring pixels up to which they show one surface.
 const SAME_SURFACE: f32 = 0.1;
@@ -37,13 +37,7 @@ impl DepthMap {
 
     /// Returns the position of a pixel's surface in scene coordinates.
     pub fn point(&self, pixel: usize) -> Vec3 {
-        let width = self.camera.width as usize;
-        let middle = Vec2::new((pixel % width) as f32 + 0.5, (pixel / width) as f32 + 0.5);
-        let place = self.camera.ray(middle) * self.depth[pixel];
-        self.camera
-            .world_to_camera
-            .inverse()
-            .transform_point3(place)
+        self.camera.point_at(pixel, self.depth[pixel])
     }
 
     /// Returns the depths at another size, row by row. 1 / depth is interpolated, which is exact on
@@ -83,6 +77,7 @@ impl DepthMap {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::Vec2;
 
     #[test]
     fn a_resized_plane_is_exact_and_edges_are_unknown() {

@@ -12,6 +12,7 @@ pub mod frame;
 pub mod keypoints;
 pub mod matching;
 pub mod photo_quality;
+mod plane;
 pub mod pose_check;
 pub mod pose_convention;
 mod process_output;

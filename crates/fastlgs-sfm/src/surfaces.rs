@@ -6,29 +6,16 @@
 //! a surface at the same depth, and not more of them may look through it.
 
 use crate::depth_map::DepthMap;
+use crate::plane::Plane;
 use fastlgs_core::dataset::SfmPoint;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, LabelMap};
-use glam::{DMat3, DVec3, Vec2, Vec3};
+use glam::{DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, VecDeque};
 
 /// Longer side of the depth maps, in pixels.
 const SIDE: u32 = 128;
-/// Smallest number of points that determine a plane.
-const MIN_POINTS: usize = 10;
-/// Smallest number of them that the view itself must see. The others are on surfaces that other
-/// views see.
-const MIN_OWN_POINTS: usize = 3;
-/// Largest relative depth error of a point on its plane. It is also the largest standard deviation
-/// of a plane's depth, relative to the depth.
-const TOLERANCE: f64 = 0.02;
-/// Smallest share of a mask's points that lie on its plane.
-const MIN_INLIERS: f64 = 0.3;
-/// Number of planes that RANSAC tries for each mask.
-const TRIALS: usize = 150;
-/// Number of refinements of the best plane by least squares.
-const REFINEMENTS: usize = 3;
 /// Factor by which a plane may extend beyond the nearest and farthest points of its view.
 const RANGE_FACTOR: f64 = 1.5;
 /// Share of the nearest and farthest points that is ignored.
@@ -67,7 +54,7 @@ impl Surfaces {
         let witnesses = witnesses(&seen, points);
         let views = (0..cameras.len()).into_par_iter().map(|view| {
             let camera = cameras[view].shrunk_to(SIDE);
-            let labels = shrunk_labels(&camera, &masks(view)?);
+            let labels = masks(view)?.resized(camera.width, camera.height).labels;
             let seen: Vec<Vec3> = seen[view].iter().map(|p| points[*p].position).collect();
             let mut known = DepthMap::empty(camera.clone());
             seen.iter().for_each(|position| known.add(*position));
@@ -292,26 +279,12 @@ fn planes(
         if map.depth[pixel] > 0.0 {
             continue;
         }
-        let middle = Vec2::new((pixel % width) as f32 + 0.5, (pixel / width) as f32 + 0.5);
-        let ray = map.camera.ray(middle).as_dvec3();
+        let ray = map.camera.ray(map.camera.pixel_centre(pixel)).as_dvec3();
         let depth = plane.and_then(|plane| all_planes[plane].depth(ray));
         let depth = depth.filter(|depth| range.contains(depth));
         map.depth[pixel] = depth.unwrap_or_default() as f32;
     }
     map
-}
-
-/// Returns the label at the centre of each pixel of a smaller camera.
-fn shrunk_labels(camera: &Camera, labels: &LabelMap) -> Vec<u16> {
-    let at = |x: u32, y: u32| {
-        let full = |at: u32, side: u32, full: u32| (2 * at + 1) * full / (2 * side);
-        labels.at(
-            full(x, camera.width, labels.width),
-            full(y, camera.height, labels.height),
-        )
-    };
-    let pixels = (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
-    pixels.map(|(x, y)| at(x, y)).collect()
 }
 
 /// Spreads the values of seeds over the pixels of their labels, in the order of distance. Returns
@@ -349,107 +322,6 @@ fn depth_range(mut depths: Vec<f64>) -> Option<std::ops::Range<f64>> {
     let last = depths.len().checked_sub(1)?;
     let cut = (OUTLIERS * last as f64) as usize;
     Some(depths[cut] / RANGE_FACTOR..depths[last - cut] * RANGE_FACTOR)
-}
-
-/// A plane n P = 1 in camera space. The residual of a point, |n P - 1|, is its relative depth
-/// error.
-struct Plane {
-    n: DVec3,
-    /// Covariance of `n`.
-    covariance: DMat3,
-}
-
-impl Plane {
-    /// Fits planes to points one after another, each to the points that the earlier ones left.
-    /// Returns the planes, and the index of each point's plane. The first `own` points are those
-    /// that the view itself sees.
-    fn fit_all(points: &[DVec3], own: usize, rng: &mut Rng) -> (Vec<Self>, Vec<Option<usize>>) {
-        let mut planes = Vec::new();
-        let mut plane_of_point = vec![None; points.len()];
-        let mut left: Vec<usize> = (0..points.len()).collect();
-        loop {
-            let positions: Vec<DVec3> = left.iter().map(|k| points[*k]).collect();
-            let own_left = left.iter().filter(|k| **k < own).count();
-            let Some(plane) = Self::fit(&positions, own_left, rng) else {
-                return (planes, plane_of_point);
-            };
-            for k in &left {
-                if plane.error(points[*k]) < TOLERANCE {
-                    plane_of_point[*k] = Some(planes.len());
-                }
-            }
-            left.retain(|k| plane_of_point[*k].is_none());
-            planes.push(plane);
-        }
-    }
-
-    /// Returns the relative depth error of a point on the plane.
-    fn error(&self, point: DVec3) -> f64 {
-        (self.n.dot(point) - 1.0).abs()
-    }
-
-    /// Fits a plane to points in camera space by RANSAC; `None` if fewer than [`MIN_INLIERS`] of
-    /// them lie on any plane.
-    fn fit(points: &[DVec3], own: usize, rng: &mut Rng) -> Option<Self> {
-        if points.len() < MIN_POINTS || own < MIN_OWN_POINTS {
-            return None;
-        }
-        let inliers = |n: DVec3| {
-            points
-                .iter()
-                .filter(move |p| (n.dot(**p) - 1.0).abs() < TOLERANCE)
-        };
-        let own_points = &points[..own];
-        let own_inliers = |n: DVec3| {
-            let is_near = |p: &&DVec3| (n.dot(**p) - 1.0).abs() < TOLERANCE;
-            own_points.iter().filter(is_near).count()
-        };
-        let mut best = (0, DVec3::ZERO);
-        for _ in 0..TRIALS {
-            let [a, b, c] = [(); 3].map(|()| points[rng.below(points.len())]);
-            let rows = DMat3::from_cols(a, b, c).transpose();
-            let volume = rows.determinant().abs();
-            if volume < 1e-6 * a.length() * b.length() * c.length() {
-                continue;
-            }
-            let n = rows.inverse() * DVec3::ONE;
-            let count = inliers(n).count();
-            if count > best.0 && own_inliers(n) >= MIN_OWN_POINTS {
-                best = (count, n);
-            }
-        }
-        let mut n = best.1;
-        let mut inverse = DMat3::ZERO;
-        for _ in 0..REFINEMENTS {
-            let outer = |p: &DVec3| DMat3::from_cols(*p * p.x, *p * p.y, *p * p.z);
-            let squares = inliers(n).map(outer).fold(DMat3::ZERO, |sum, m| sum + m);
-            if squares.determinant() <= 0.0 {
-                return None;
-            }
-            inverse = squares.inverse();
-            n = inverse * inliers(n).copied().sum::<DVec3>();
-        }
-        let count = inliers(n).count();
-        let own_count = own_inliers(n);
-        let is_supported =
-            own_count >= MIN_OWN_POINTS && own_count as f64 >= MIN_INLIERS * own as f64;
-        if count < MIN_POINTS || !is_supported {
-            return None;
-        }
-        let squares: f64 = inliers(n).map(|p| (n.dot(*p) - 1.0).powi(2)).sum();
-        Some(Self {
-            n,
-            covariance: inverse * (squares / count as f64),
-        })
-    }
-
-    /// Returns the depth along a ray with z = 1; `None` behind the camera, or where the points
-    /// leave it uncertain.
-    fn depth(&self, ray: DVec3) -> Option<f64> {
-        let depth = 1.0 / self.n.dot(ray);
-        let deviation = depth * ray.dot(self.covariance * ray).max(0.0).sqrt();
-        (depth > 0.0 && depth.is_finite() && deviation < TOLERANCE).then_some(depth)
-    }
 }
 
 #[cfg(test)]

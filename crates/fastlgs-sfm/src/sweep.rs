@@ -65,14 +65,7 @@ impl View {
 
     /// Returns the world position at a depth along the ray through a pixel's centre.
     fn point(&self, pixel: usize, depth: f32) -> Vec3 {
-        let middle = Vec2::new(
-            (pixel % self.width()) as f32 + 0.5,
-            (pixel / self.width()) as f32 + 0.5,
-        );
-        self.camera
-            .world_to_camera
-            .inverse()
-            .transform_point3(self.camera.ray(middle) * depth)
+        self.camera.point_at(pixel, depth)
     }
 }
 

@@ -122,18 +122,20 @@ pub fn render(config: &RenderConfig, run: &Run) -> Result<RenderReport> {
             ];
             exr_image::write(&path("feature", "exr"), w, h, &channels)?;
         }
-        if config.what.contains(&RenderContent::Depth) {
+        let uses_depth = [RenderContent::Depth, RenderContent::Normal];
+        if uses_depth.iter().any(|what| config.what.contains(what)) {
             let mut depth = timed(&mut rendered, || scene.render_depth(camera))?;
-            let unit = scene.manifest().frame.scale as f32;
-            depth.iter_mut().for_each(|depth| *depth *= unit);
-            exr_image::write(&path("depth", "exr"), w, h, &[("Z", &depth)])?;
-        }
-        if config.what.contains(&RenderContent::Normal) {
-            let depth = timed(&mut rendered, || scene.render_depth(camera))?;
-            let normals = normal_map::normals(camera, &depth);
-            let color = |x, y| Rgb(normal_map::color(normals[y as usize * w + x as usize]));
-            let picture = RgbImage::from_fn(camera.width, camera.height, color);
-            image_io::save_png(&path("normal", "png"), picture)?;
+            if config.what.contains(&RenderContent::Normal) {
+                let normals = normal_map::normals(camera, &depth);
+                let color = |x, y| Rgb(normal_map::color(normals[y as usize * w + x as usize]));
+                let picture = RgbImage::from_fn(camera.width, camera.height, color);
+                image_io::save_png(&path("normal", "png"), picture)?;
+            }
+            if config.what.contains(&RenderContent::Depth) {
+                let unit = scene.manifest().frame.scale as f32;
+                depth.iter_mut().for_each(|depth| *depth *= unit);
+                exr_image::write(&path("depth", "exr"), w, h, &[("Z", &depth)])?;
+            }
         }
         if config.what.contains(&RenderContent::Objects) {
             let ids = timed(&mut rendered, || scene.field(camera, None))?.owners(&*scene.grid()?);
