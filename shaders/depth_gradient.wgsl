@@ -27,6 +27,8 @@ struct DepthLoss {
 
 // Spread of ln z below which the loss is quadratic.
 const SOFTNESS: f32 = 0.01;
+// Weight of pixels with an unknown depth, relative to the others.
+const GATHERING: f32 = 0.25;
 // Opacity below which a pixel has no depth.
 const MIN_OPACITY: f32 = 0.001;
 
@@ -49,7 +51,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let squares = max(m2 - 2.0 * u * m1 + u * u * m0, vec4<f32>(0.0));
     let inside = columns < vec4<u32>(loss.size.x) & vec4<bool>(row < loss.size.y);
     let counts = inside & m0 >= vec4<f32>(MIN_OPACITY) & depth >= vec4<f32>(0.0);
-    let weight = select(vec4<f32>(0.0), vec4<f32>(loss.scale), counts);
+    let scale = loss.scale * select(vec4<f32>(GATHERING), vec4<f32>(1.0), known);
+    let weight = select(vec4<f32>(0.0), scale, counts);
     let by_m2 = 0.5 * weight / sqrt(squares + SOFTNESS * SOFTNESS);
     gradient[3u * plane + place] = -2.0 * u * by_m2;
     gradient[4u * plane + place] = by_m2;

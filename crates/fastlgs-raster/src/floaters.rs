@@ -169,7 +169,7 @@ impl FreeSpace {
         }
     }
 
-    /// Returns the space before surfaces that at least [`MIN_VIEWS`] cameras see. `maps` has a
+    /// Returns the space before surfaces that at least two cameras see. `maps` has a
     /// camera and the depths at its pixels, row by row; 0 where no surface is known.
     pub fn before_surfaces<'a>(maps: impl Iterator<Item = (&'a Camera, &'a [f32])>) -> Self {
         let of = |(camera, depth): (&Camera, &[f32])| CameraFreeSpace {

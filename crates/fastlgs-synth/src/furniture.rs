@@ -4,7 +4,7 @@
 use super::props::{BRASS, BuildFn, DARKER, Look, OWN, Piece, WOOD, piece};
 use super::solid::Shape::{Ball, Block, Cone, Cylinder};
 use glam::Vec3;
-use std::f32::consts::{FRAC_PI_2, TAU};
+use std::f32::consts::{FRAC_PI_2, PI, TAU};
 
 const BLACK: Look = Look::Painted(Vec3::new(0.07, 0.07, 0.08));
 const STEEL: Look = Look::Painted(Vec3::new(0.62, 0.64, 0.67));
@@ -84,6 +84,76 @@ pub fn study() -> [Placed; 12] {
             0.8,
         ),
     ]
+}
+
+/// Half extents of the bare room in metres.
+pub const BARE_ROOM: Vec3 = Vec3::new(3.0, 1.3, 2.5);
+
+/// Returns the furniture of the bare room. It stands along the walls.
+pub fn bare_room() -> [Placed; 11] {
+    let red = Vec3::new(0.75, 0.1, 0.1);
+    let Vec3 { x, z, .. } = BARE_ROOM;
+    let placed = |name, make: BuildFn, at, yaw| Placed {
+        name,
+        make,
+        color: red,
+        at,
+        yaw,
+    };
+    let table = [x - 0.9, z - 0.9];
+    [
+        placed("bookcase", bookcase, [-0.9, 0.0, 0.2 - z], 0.0),
+        placed("picture", picture, [1.1, 0.0, 0.03 - z], 0.0),
+        placed("television", television, [x - 0.25, 0.0, -0.9], -FRAC_PI_2),
+        placed("dining table", dining_table, [table[0], 0.0, table[1]], 0.0),
+        placed("table lamp", table_lamp, [table[0], 0.738, table[1]], 0.0),
+        placed(
+            "coffee mug",
+            coffee_mug,
+            [table[0] - 0.35, 0.738, table[1] - 0.2],
+            2.0,
+        ),
+        placed("door", door, [-0.6, 0.0, z - 0.03], PI),
+        placed("umbrella", umbrella, [0.6 - x, 0.0, z - 0.6], 0.0),
+        placed(
+            "washing machine",
+            washing_machine,
+            [0.32 - x, 0.0, 0.3],
+            FRAC_PI_2,
+        ),
+        placed("window", window, [0.03 - x, 0.0, -1.2], FRAC_PI_2),
+        placed("soccer ball", soccer_ball, [1.9, 0.0, 0.4 - z], 0.3),
+    ]
+}
+
+/// A closed door with a handle.
+fn door() -> Vec<Piece> {
+    vec![
+        piece(Block, [0.0, 1.0, 0.0], [0.45, 1.0, 0.03], WOOD),
+        piece(Block, [0.37, 1.02, 0.05], [0.05, 0.012, 0.012], STEEL),
+    ]
+}
+
+/// A window with a cross of bars, at eye level.
+fn window() -> Vec<Piece> {
+    let sky = Look::Fixed(Vec3::new(0.55, 0.7, 0.85));
+    let bar = |half: [f32; 3]| piece(Block, [0.0, 1.5, 0.03], half, WHITE);
+    vec![
+        piece(Block, [0.0, 1.5, 0.0], [0.6, 0.5, 0.03], sky),
+        bar([0.6, 0.03, 0.02]),
+        bar([0.03, 0.5, 0.02]),
+    ]
+}
+
+/// A picture with four fields of colour, at eye level.
+fn picture() -> Vec<Piece> {
+    let field = |k: usize| {
+        let side = |bit: usize| if k & bit == 0 { -0.2 } else { 0.2 };
+        let at = [side(1), 1.5 + 0.75 * side(2), 0.025];
+        piece(Block, at, [0.2, 0.15, 0.01], Look::Painted(SPINES[k + 1]))
+    };
+    let frame = piece(Block, [0.0, 1.5, 0.0], [0.45, 0.35, 0.02], BLACK);
+    std::iter::once(frame).chain((0..4).map(field)).collect()
 }
 
 /// A bookcase full of books.
@@ -264,7 +334,7 @@ fn coffee_mug() -> Vec<Piece> {
         ),
     ];
     for k in 0..9 {
-        let angle = FRAC_PI_2 - std::f32::consts::PI * k as f32 / 8.0;
+        let angle = FRAC_PI_2 - PI * k as f32 / 8.0;
         let at = [
             0.062 + 0.045 * angle.cos(),
             0.078 + 0.048 * angle.sin(),

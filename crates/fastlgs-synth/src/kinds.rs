@@ -6,7 +6,7 @@ use super::hierarchy::Hierarchy;
 use super::props::{self, BuildFn, Look, Piece};
 use super::solid::{Shape, Solid};
 use super::surface::Surface;
-use super::walks::{CORE, CORRIDOR, Ring, corridor_path, walk};
+use super::walks::{CORE, CORRIDOR, Ring, corridor_path, turns, walk};
 use super::{Backdrop, SceneObject, World};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Error, Result, image_io};
@@ -32,6 +32,7 @@ pub const TEXTURES: [&str; 2] = ["gravel.png", "brick.png"];
 pub enum Kind {
     Room,
     Study,
+    Bare,
     Table,
     Twins,
     Nested,
@@ -46,7 +47,7 @@ pub enum Kind {
 }
 
 /// All kinds, each with its name and a description for users.
-pub const KINDS: [(&str, Kind, &str); 13] = [
+pub const KINDS: [(&str, Kind, &str); 14] = [
     (
         "room",
         Kind::Room,
@@ -56,6 +57,11 @@ pub const KINDS: [(&str, Kind, &str); 13] = [
         "study",
         Kind::Study,
         "a furnished room: a table with small objects, a bookcase, a television and other furniture",
+    ),
+    (
+        "bare",
+        Kind::Bare,
+        "a room with bare walls, photographed by a person who turns more than they move",
     ),
     ("table", Kind::Table, "twelve different objects on a table"),
     (
@@ -128,7 +134,7 @@ impl Kind {
         match self {
             Self::Sparse => 8,
             Self::Long => 200,
-            Self::Big => 60,
+            Self::Big | Self::Bare => 60,
             _ => 40,
         }
     }
@@ -158,7 +164,7 @@ impl Kind {
         match self {
             Self::Room => return room(pictures, views, size, seed),
             Self::Study => {
-                build.study();
+                build.furnish(&furniture::study());
                 let ring = Ring {
                     radius: 3.3,
                     height: 1.6,
@@ -167,6 +173,10 @@ impl Kind {
                     fov: 0.8,
                 };
                 cameras = ring.cameras(views, size);
+            }
+            Self::Bare => {
+                build.bare_room();
+                cameras = turns(views, size);
             }
             Self::Table | Self::Sparse => build.dozen(),
             Self::Dark => {
@@ -372,27 +382,46 @@ impl Builder {
         }
     }
 
-    fn study(&mut self) {
-        for furniture::Placed {
-            name,
-            make,
-            color,
-            at,
-            yaw,
-        } in furniture::study()
-        {
-            self.add(
-                name,
-                make(),
-                Material::Grain(color),
-                &Place {
-                    at: at.into(),
-                    scale: 1.0,
-                    yaw,
-                },
-                false,
-            );
+    fn furnish(&mut self, furniture: &[furniture::Placed]) {
+        for item in furniture {
+            let place = Place {
+                at: item.at.into(),
+                scale: 1.0,
+                yaw: item.yaw,
+            };
+            let material = Material::Grain(item.color);
+            self.add(item.name, (item.make)(), material, &place, false);
         }
+    }
+
+    /// Adds a room whose floor, ceiling and walls are objects of one colour each, and its furniture.
+    fn bare_room(&mut self) {
+        const THICKNESS: f32 = 0.05;
+        let half = furniture::BARE_ROOM;
+        let sides = [
+            ("floor", Vec3::NEG_Y, Vec3::new(0.55, 0.47, 0.4)),
+            ("ceiling", Vec3::Y, Vec3::splat(0.95)),
+            ("north wall", Vec3::NEG_Z, Vec3::new(0.9, 0.89, 0.86)),
+            ("south wall", Vec3::Z, Vec3::new(0.9, 0.89, 0.86)),
+            ("west wall", Vec3::NEG_X, Vec3::new(0.82, 0.84, 0.86)),
+            ("east wall", Vec3::X, Vec3::new(0.82, 0.84, 0.86)),
+        ];
+        for (name, outwards, color) in sides {
+            let object = self.object_id(name, 0);
+            let across = outwards.abs();
+            self.solids.push(Solid {
+                shape: Shape::Block,
+                centre: Vec3::Y * half.y + outwards * (half + THICKNESS),
+                half: half * (Vec3::ONE - across) + THICKNESS * across,
+                rotation: Mat3::IDENTITY,
+                surface: Surface::Grain {
+                    colors: [color; 2],
+                    grain: 1.0,
+                },
+                object,
+            });
+        }
+        self.furnish(&furniture::bare_room());
     }
 
     fn twins(&mut self) {

@@ -91,3 +91,25 @@ pub fn walk(count: usize, (width, height): (u32, u32)) -> Vec<Camera> {
     };
     (0..count).map(at).collect()
 }
+
+/// Returns `count` cameras of a person who turns twice around while moving once along a small
+/// ellipse in the middle of a room, so that neighbouring views have little parallax.
+pub fn turns(count: usize, (width, height): (u32, u32)) -> Vec<Camera> {
+    let at = |k: usize| {
+        let angle = TAU * k as f32 / count as f32;
+        let (s, c) = angle.sin_cos();
+        let eye = Vec3::new(0.9 * c, 1.45 + 0.1 * (3.0 * angle).sin(), 0.6 * s);
+        let (s, c) = (2.0 * angle).sin_cos();
+        let ahead = Vec3::new(c, -0.2, s);
+        Camera::look_at(
+            &format!("{k:03}.png"),
+            eye,
+            eye + ahead,
+            Vec3::Y,
+            width,
+            height,
+            1.1,
+        )
+    };
+    (0..count).map(at).collect()
+}

@@ -4,6 +4,8 @@ use crate::view::DepthLoss;
 
 /// Spread of ln z below which the loss is quadratic.
 const SOFTNESS: f32 = 0.01;
+/// Weight of pixels with an unknown depth, relative to the others.
+const GATHERING: f32 = 0.25;
 /// Opacity below which a pixel has no depth.
 const MIN_OPACITY: f32 = 0.001;
 
@@ -28,14 +30,14 @@ pub fn depth_gradient(loss: &DepthLoss, frame: &[f32], targets: &[u32], gradient
 /// docs/how-it-works.md, 5.7.
 #[inline(always)]
 pub(crate) fn depth_gradient_at([m1, m2, m0]: [f32; 3], depth: f32, scale: f32) -> [f32; 3] {
-    let u = if depth > 0.0 {
-        depth.ln()
+    let (u, share) = if depth > 0.0 {
+        (depth.ln(), 1.0)
     } else {
-        m1 / m0.max(MIN_OPACITY)
+        (m1 / m0.max(MIN_OPACITY), GATHERING)
     };
     let squares = (m2 - 2.0 * u * m1 + u * u * m0).max(0.0);
     let counts = m0 >= MIN_OPACITY && depth >= 0.0;
-    let weight = if counts { scale } else { 0.0 };
+    let weight = if counts { share * scale } else { 0.0 };
     let by_m2 = 0.5 * weight / (squares + SOFTNESS * SOFTNESS).sqrt();
     [-2.0 * u * by_m2, by_m2, u * u * by_m2]
 }

@@ -184,10 +184,13 @@ fn depth_loss(planes: &[f64], depth: &[f32]) -> f64 {
     let of_pixel = |(pixel, depth): (usize, &f32)| {
         let [m1, m2, m0] = [3, 4, 5].map(|channel| planes[channel * n + pixel]);
         let depth = f64::from(*depth);
-        let u = if depth > 0.0 { depth.ln() } else { m1 / m0 };
+        let (u, weight) = match depth {
+            known if known > 0.0 => (known.ln(), 1.0),
+            ignored if ignored < 0.0 => (0.0, 0.0),
+            _ => (m1 / m0, 0.25),
+        };
         let squares = m2 - 2.0 * u * m1 + u * u * m0;
-        let counts = f64::from(u8::from(depth >= 0.0));
-        counts * (squares + 0.01f64.powi(2)).sqrt()
+        weight * (squares + 0.01f64.powi(2)).sqrt()
     };
     depth.iter().enumerate().map(of_pixel).sum::<f64>() / n as f64
 }

@@ -118,6 +118,8 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
     let targets = targets(config, &mut scene, &grid)?;
     let objects: Vec<u16> = targets.iter().map(|t| t.id).collect();
     let hidden = HiddenPixels::of(&mut scene, &grid, &targets)?;
+    extend_object(&mut scene, &grid, &objects, &hidden)?;
+    let hidden = HiddenPixels::of(&mut scene, &grid, &targets)?;
     let left = remaining(&mut scene, &grid, &objects, &hidden)?;
     if left.is_empty() {
         bail!(
@@ -231,6 +233,22 @@ impl HiddenPixels {
     }
 }
 
+/// Gives the first of `objects` the Gaussians that stand where they are.
+fn extend_object(
+    scene: &mut Scene,
+    grid: &Grid,
+    objects: &[u16],
+    hidden: &HiddenPixels,
+) -> Result<()> {
+    let own = selection::gaussians(scene.gaussians(), grid, objects);
+    let protruding = behind::protruding_gaussians(scene, &own, &hidden.in_training)?;
+    let mut gaussians = scene.gaussians().clone();
+    for i in protruding {
+        (gaussians.object_ids[i], gaussians.features[i]) = (objects[0], grid.code_of(objects[0]));
+    }
+    scene.set_gaussians(gaussians)
+}
+
 /// Returns the indices of the Gaussians that remain. Photos do not show transparent Gaussians, so
 /// all of them remain, except those of the removed objects.
 fn remaining(
@@ -336,12 +354,7 @@ fn fill(
         if count_set(&gap) as f64 <= MIN_GAP_SHARE * n as f64 || count_set(&gap) == n {
             continue;
         }
-        let depth = scene.render_depth(camera)?;
-        let mut inverse: Vec<f32> = depth
-            .iter()
-            .map(|depth| if depth.is_finite() { 1.0 / depth } else { 0.0 })
-            .collect();
-        Membrane::fill_planes(&mut inverse, &gap, width);
+        let inverse = behind::inverse_depth_behind(&scene.render_depth(camera)?, &gap, width);
         let mut colors = solid_colors(scene, camera)?;
         inpainter.fill(&mut colors, &gap, camera.width)?;
         let ids = membrane::extend_labels(

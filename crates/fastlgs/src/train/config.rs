@@ -150,9 +150,9 @@ const OFFLINE_THETA: f32 = 0.7;
 /// weight lowers it by 0.1 dB.
 const FEATURE_WEIGHT: f32 = 0.2;
 
-/// Default weight of the depth loss, an error of ln depth, relative to the colour loss. It is off,
-/// because it lowers the PSNR of photos with texture (docs/research/rooms.md).
-const DEPTH_WEIGHT: f32 = 0.0;
+/// Default weight of the depth loss, an error of ln depth, relative to the colour loss
+/// (docs/research/rooms.md).
+const DEPTH_WEIGHT: f32 = 0.4;
 
 /// Least number of training pixels per Gaussian of an automatic budget. A Gaussian has 14
 /// parameters and a pixel has three values. With fewer pixels, Gaussians overfit the photos.
@@ -267,9 +267,8 @@ pub struct TrainConfig {
     /// --borders. Both losses move Gaussians, unless --freeze is set.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = FEATURE_WEIGHT))]
     pub feature_weight: f32,
-    /// Weight of the depth loss, which keeps Gaussians on surfaces where photos have no texture; 0
-    /// for none. It is multiplied by the square of the share of the photos without texture. 1.5
-    /// suits rooms with bare walls.
+    /// Weight of the depth loss, which keeps Gaussians on the planes that masks show; 0 for none.
+    /// It is used if at least 40 % of the photos have no texture, as in rooms with bare walls.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = DEPTH_WEIGHT))]
     pub depth_weight: f32,
     /// Continue from the last checkpoint.
@@ -317,9 +316,10 @@ fn off_if_auto(switch: Switch) -> Switch {
 }
 
 impl TrainConfig {
-    /// Returns whether few photos get a treatment of their own: a backdrop, and removal of floaters
-    /// from empty space. The paper has none.
-    pub(super) fn treats_few_views(&self) -> bool {
+    /// Returns whether photos that determine little get a treatment of their own, which the paper
+    /// does not have: few photos a backdrop, and bare ones surfaces; floaters are removed from empty
+    /// space.
+    pub(super) fn treats_weak_photos(&self) -> bool {
         self.preset != Preset::LikePaper
     }
 
@@ -332,7 +332,6 @@ impl TrainConfig {
                 exposure: off_if_auto(self.exposure),
                 align: off_if_auto(self.align),
                 budget: Some(self.budget.unwrap_or(self.preset.values().2)),
-                depth_weight: 0.0,
                 ..self.clone()
             },
             _ => self.clone(),
@@ -347,7 +346,7 @@ impl TrainConfig {
     /// Returns the default of the highest SH degree for a number of training views.
     pub(super) fn degree(&self, views: usize) -> u32 {
         let (_, degree, _) = self.preset.values();
-        if views < FEW_VIEWS && self.treats_few_views() {
+        if views < FEW_VIEWS && self.treats_weak_photos() {
             degree.min(FEW_VIEWS_SH_DEGREE)
         } else {
             degree
@@ -423,7 +422,7 @@ mod tests {
         assert_eq!(resolved.budget(usize::MAX), Budget::Fixed(1_000_000));
         assert_eq!(resolved.iterations(), 30_000);
         assert_eq!(resolved.degree(3), 3);
-        assert!(!resolved.treats_few_views() && !resolved.masks_guide_training("sam"));
+        assert!(!resolved.treats_weak_photos() && !resolved.masks_guide_training("sam"));
         let algorithm = resolved.paper("clip");
         assert_eq!(
             (algorithm.tau, algorithm.theta, algorithm.alpha),

@@ -2,6 +2,7 @@
 
 use super::config::{Background, TrainConfig};
 use super::report::TrainReport;
+use super::texture;
 use crate::error::bail;
 use crate::masks;
 use crate::{Result, Run, SceneNotes};
@@ -21,6 +22,9 @@ use std::sync::Arc;
 
 /// Least number of initial Gaussians. Random points are added if there are fewer.
 const MIN_INITIAL_GAUSSIANS: usize = 5000;
+/// Least share of the photos without texture from which surfaces are used. In a room with white
+/// walls it is 0.5; photos of things are from 0 to 0.3, and surfaces lower their PSNR.
+const MIN_BARE_SHARE: f32 = 0.4;
 
 /// Returns the initial Gaussians: those of `config.init`, else one for each point of the scene. A
 /// backdrop is added if there are fewer than [`FEW_VIEWS`] views, and random points if there are
@@ -59,7 +63,7 @@ pub fn gaussians(
         .cameras
         .iter()
         .any(|camera| folder.alpha_path(&camera.name).is_file());
-    let backdrop = if views.len() < FEW_VIEWS && config.treats_few_views() && !cut_out {
+    let backdrop = if views.len() < FEW_VIEWS && config.treats_weak_photos() && !cut_out {
         init::backdrop(views, &points, most / 2)?
     } else {
         Gaussians::default()
@@ -80,16 +84,20 @@ pub fn gaussians(
 }
 
 /// Returns the surfaces of the training views: planes through the points that their masks show.
-/// `None` without a depth loss, or if training starts from the Gaussians of a file.
+/// `None` if the photos have enough texture, if they are few, or if training starts from the
+/// Gaussians of a file.
 pub fn surfaces(
     config: &TrainConfig,
     folder: &SceneFolder,
-    cameras: &[Camera],
+    targets: &Targets,
 ) -> Result<Option<Surfaces>> {
-    if config.init.is_some() || config.depth_weight <= 0.0 || config.iterations() == 0 {
+    let is_off = !config.treats_weak_photos() || config.depth_weight <= 0.0;
+    let starts_from_points = config.init.is_none() && config.iterations() > 0;
+    let is_few = targets.len() < FEW_VIEWS;
+    if is_off || !starts_from_points || is_few || texture::bare_share(targets)? < MIN_BARE_SHARE {
         return Ok(None);
     }
-    let points = folder.points()?;
+    let (cameras, points) = (&targets.cameras, folder.points()?);
     let masks = |view: usize| masks::whole_masks(folder, &cameras[view]);
     Surfaces::new(cameras, &points, masks).map(Some)
 }
@@ -224,7 +232,7 @@ pub fn free_space(
     first: &Gaussians,
     surfaces: Option<&Surfaces>,
 ) -> Result<FreeSpace> {
-    let few = cameras.len() < FEW_VIEWS && config.treats_few_views();
+    let few = cameras.len() < FEW_VIEWS && config.treats_weak_photos();
     if few && config.iterations() > 0 {
         return Ok(FreeSpace::of(cameras, &first.means, &folder.points()?));
     }

@@ -1,6 +1,6 @@
 //! Trains the Gaussians of a scene.
 
-use super::{CurvePoint, Inputs, Mapping, init, mask_supervision, texture};
+use super::{CurvePoint, Inputs, Mapping, init, mask_supervision};
 use crate::progress::{Message, TrainStep};
 use crate::train::settings::settings;
 use crate::{Result, Run, checkpoints, objects, stop_point, transparent};
@@ -39,7 +39,7 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
     held_out.check()?;
     let device = fastlgs_raster::choice(run.device);
     let mut engine = fastlgs_raster::open_engine(&device.device)?;
-    let surfaces = init::surfaces(config, folder, &inputs.training)?;
+    let surfaces = init::surfaces(config, folder, &targets)?;
     let first = initial_gaussians(inputs, &targets, surfaces.as_ref(), &mut *engine, run)?;
     let kept_transparent = match config.mapping {
         Mapping::Keep => transparent::take_transparent(&mut folder.gaussians()?),
@@ -48,10 +48,7 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
     let brightness = inputs.notes.brightness.clone().unwrap_or_default();
     let manifest = &inputs.manifest;
     let mut settings = settings(config, &first, &targets, manifest, &brightness, run.seed);
-    settings.depth_weight = match surfaces {
-        Some(_) => config.depth_weight * texture::bare_share(&targets)?.powi(2),
-        None => 0.0,
-    };
+    settings.depth_weight = surfaces.as_ref().map_or(0.0, |_| config.depth_weight);
     let free = init::free_space(config, folder, &inputs.training, &first, surfaces.as_ref())?;
     let targets = match surfaces {
         Some(surfaces) => init::with_depths(targets, surfaces.maps),
