@@ -16,7 +16,8 @@ struct Step {
     end_channel: u32,
     // Weight of the sum of opacities in the loss.
     opacity_weight: f32,
-    unused: u32,
+    // Number of first Gaussians of the page that do not change.
+    frozen: u32,
     // Learning rates of the channels below SH_REST, then one for all SH coefficients above degree
     // 0.
     rates: array<vec4<f32>, 5>,
@@ -34,6 +35,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if i >= step.quads {
         return;
     }
+    let moves = vec4<u32>(4u * i) + vec4<u32>(0u, 1u, 2u, 3u) >= vec4<u32>(step.frozen);
     for (var channel = step.first_channel; channel < step.end_channel; channel++) {
         let k = channel * step.quads + i;
         let slot = min(channel, SH_REST);
@@ -52,6 +54,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         // Codes lie in (0, 1)^3 (paper). Without the clamp, a nearly invisible Gaussian would leave
         // this range to compensate others.
         let is_feature = channel >= FEATURE && channel < SH_REST;
-        params[k] = select(next, clamp(next, vec4(0.0), vec4(1.0)), is_feature);
+        let in_range = select(next, clamp(next, vec4(0.0), vec4(1.0)), is_feature);
+        params[k] = select(value, in_range, moves);
     }
 }

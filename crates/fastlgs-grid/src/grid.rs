@@ -225,15 +225,15 @@ impl Grid {
         (0..=self.highest()).map(inside).collect()
     }
 
-    /// Returns the table without some objects and their parts, and the new id of each old id; 0 for
-    /// removed ones.
-    pub fn without(&self, removed: &[u16]) -> (Self, Vec<u16>) {
+    /// Returns the table without some objects, and the new id of each old id; 0 for removed ones.
+    /// `gone` says for each object whether it is removed.
+    pub fn without(&self, gone: &[bool]) -> (Self, Vec<u16>) {
         let mut left = 0;
-        let number = |gone: bool| {
+        let number = |gone: &bool| {
             left += u16::from(!gone);
-            if gone { 0 } else { left }
+            if *gone { 0 } else { left }
         };
-        let numbers: Vec<u16> = self.parts(removed).into_iter().map(number).collect();
+        let numbers: Vec<u16> = gone.iter().map(number).collect();
         let new = |id: u16| {
             usize::from(id)
                 .checked_sub(1)

@@ -5,7 +5,6 @@ use crate::grid::PART;
 use crate::observations::Observations;
 use crate::overlaps::{self, Overlaps};
 use crate::support::Support;
-use std::collections::BTreeSet;
 
 /// Conditions for a set to be an object.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -52,25 +51,6 @@ impl Chosen {
     /// Returns for each id the objects that it denotes, smallest first.
     pub fn lists(&self) -> Vec<Vec<u16>> {
         self.overlaps.lists(&self.parents)
-    }
-
-    /// Partitions the objects into layers. Objects of a layer share no Gaussians.
-    pub fn layers(&self) -> Vec<BTreeSet<u16>> {
-        let mut beside: Vec<BTreeSet<u16>> = vec![BTreeSet::new(); self.parents.len() + 1];
-        for list in self.lists() {
-            list.iter()
-                .for_each(|id| beside[usize::from(*id)].extend(&list));
-        }
-        let mut layers: Vec<BTreeSet<u16>> = Vec::new();
-        for id in 1..=self.parents.len() as u16 {
-            let place = layers
-                .iter()
-                .position(|layer| layer.is_disjoint(&beside[usize::from(id)]))
-                .unwrap_or(layers.len());
-            layers.resize(layers.len().max(place + 1), BTreeSet::new());
-            layers[place].insert(id);
-        }
-        layers
     }
 }
 
@@ -276,7 +256,7 @@ mod tests {
                 .collect::<Vec<_>>()
         );
         assert_eq!(
-            found.layers(),
+            overlaps::layers(&found.lists(), found.parents.len()),
             [BTreeSet::from([1]), BTreeSet::from([2, 3])]
         );
         assert_eq!(

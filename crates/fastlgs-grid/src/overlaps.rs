@@ -3,7 +3,7 @@
 //! Objects have the ids 1..=K in descending order of size. Id k denotes object k and all its
 //! ancestors. Ids above K denote other combinations of objects, each by a list.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Object lists that are not a chain of parents. Id K + 1 + i denotes list i. A list holds object
 /// ids in descending order, so small objects come first.
@@ -121,6 +121,26 @@ fn with_ancestors(id: u16, parents: &[u16]) -> Vec<u16> {
     let up =
         |id: &u16| Some(parents[usize::from(*id) - 1]).filter(|above| (1..*id).contains(above));
     std::iter::successors(Some(id).filter(|id| *id > 0), up).collect()
+}
+
+/// Partitions the objects 1 to `objects` into layers. Objects of a layer share no Gaussians. `lists`
+/// holds the objects of each id.
+pub fn layers(lists: &[Vec<u16>], objects: usize) -> Vec<BTreeSet<u16>> {
+    let mut beside: Vec<BTreeSet<u16>> = vec![BTreeSet::new(); objects + 1];
+    for list in lists {
+        list.iter()
+            .for_each(|id| beside[usize::from(*id)].extend(list));
+    }
+    let mut layers: Vec<BTreeSet<u16>> = Vec::new();
+    for id in 1..=objects as u16 {
+        let place = layers
+            .iter()
+            .position(|layer| layer.is_disjoint(&beside[usize::from(id)]))
+            .unwrap_or(layers.len());
+        layers.resize(layers.len().max(place + 1), BTreeSet::new());
+        layers[place].insert(id);
+    }
+    layers
 }
 
 #[cfg(test)]

@@ -45,6 +45,10 @@ pub struct TrainerConfig {
     pub budget: Budget,
     /// Channels that are trained.
     pub channels: crate::Channels,
+    /// Number of first Gaussians that do not change. Density control would change them, so it must
+    /// be off.
+    #[serde(default)]
+    pub frozen: usize,
     /// Highest SH degree of colour; the degree rises during training.
     pub sh_degree: u32,
     /// SH degree at the start: that of the first Gaussians if they were already trained, else 0.
@@ -87,6 +91,21 @@ pub struct TrainerConfig {
 }
 
 impl TrainerConfig {
+    /// Returns this configuration for Gaussians that are already trained: no density control, full
+    /// resolution, and no price on opacity.
+    #[must_use]
+    pub fn for_refinement(self) -> Self {
+        Self {
+            refine_from: 1.0,
+            refine_until: 0.0,
+            coarse_until: 0.0,
+            depth_weight: 0.0,
+            mean_opacity_weight: 0.0,
+            max_dropout: 0.0,
+            ..self
+        }
+    }
+
     /// Returns this configuration with the schedule of 3DGS: full resolution, growth from step 500
     /// to the middle of 30,000 steps, opacity resets instead of a price on opacity, and nothing for
     /// few photos.
@@ -111,6 +130,7 @@ impl Default for TrainerConfig {
             seed: 0,
             budget: Budget::Fixed(60_000),
             channels: crate::Channels::Color,
+            frozen: 0,
             sh_degree: 0,
             first_degree: 0,
             lambda: 0.2,

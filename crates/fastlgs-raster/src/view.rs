@@ -237,7 +237,8 @@ pub struct Step {
     pub end_channel: u32,
     /// Weight of the sum of opacities in the loss.
     pub opacity_weight: f32,
-    pub(crate) unused: u32,
+    /// Number of first Gaussians that do not change.
+    pub frozen: u32,
     /// Learning rates of the base channels, then that of all SH coefficients above degree 0.
     pub rates: [f32; 20],
 }
@@ -259,7 +260,7 @@ impl Step {
             first_channel: range.start as u32,
             end_channel: range.end as u32,
             opacity_weight: 0.0,
-            unused: 0,
+            frozen: 0,
             rates: all,
         }
     }

@@ -12,6 +12,7 @@ use fastlgs_grid::{Grid, codes, consensus, election, field, overlaps};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Engine, View};
 use fastlgs_sfm::photo_quality::{self, PhotoStats};
+use fastlgs_vision::Encoder;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
@@ -281,14 +282,9 @@ pub fn embed_objects(
 ) -> Result<(Grid, Summary)> {
     let lists = chosen.lists();
     let embedding_views = embedding_views(scene, training, &chosen);
-    let (found, object_of) = embed(
-        folder,
-        training,
-        &chosen.layers(),
-        &lists,
-        &embedding_views,
-        run,
-    )?;
+    let encoder = model_choice::encoder_of(folder, &folder.manifest()?)?;
+    let found = embed(folder, training, &lists, &embedding_views, &*encoder, run)?;
+    let object_of: Vec<u16> = found.iter().map(|mask| mask.label).collect();
     let mut grid = Grid::build(
         &found,
         &object_of,
@@ -310,31 +306,37 @@ pub fn embed_objects(
     Ok((grid, summary))
 }
 
-/// Embeds every object in its best views, and returns the masks and their object ids.
-/// `embedding_views` holds the view indices of each object. Objects in one entry of `layers` share
-/// no Gaussians. `lists` holds the objects of each id.
-fn embed(
+/// Embeds objects, and returns their masks; the label of a mask is its object's id.
+/// `embedding_views` holds the indices of the views in which each object is embedded. `lists` holds
+/// the objects of each id.
+pub(crate) fn embed(
     folder: &SceneFolder,
     training: &[Camera],
-    layers: &[BTreeSet<u16>],
     lists: &[Vec<u16>],
     embedding_views: &[Vec<usize>],
+    encoder: &dyn Encoder,
     run: &Run,
-) -> Result<(Vec<Mask>, Vec<u16>)> {
-    let encoder = model_choice::encoder_of(folder, &folder.manifest()?)?;
+) -> Result<Vec<Mask>> {
+    // Objects that share Gaussians have no common map.
+    let layers = overlaps::layers(lists, embedding_views.len());
     let work = run.work("embeddings", training.len() as u64);
     // Views are embedded in parallel, because one view has too few masks for many cores.
     let of_view = |(view, camera): (usize, &Camera)| -> Result<(Vec<Mask>, PhotoStats)> {
         let map = folder.objects(&camera.name)?;
         let photo = folder.photo(&camera.name)?;
         let mut found = Vec::new();
-        for layer in layers {
+        for layer in &layers {
             let mut wanted = layer.clone();
             wanted.retain(|id| embedding_views[usize::from(*id) - 1].contains(&view));
             if !wanted.is_empty() {
                 let map = map_of(&map, &wanted, lists);
-                let (name, encoder) = (&camera.name, encoder.as_ref());
-                found.extend(masks::descriptors(name, &photo, view, &map, encoder)?);
+                found.extend(masks::descriptors(
+                    &camera.name,
+                    &photo,
+                    view,
+                    &map,
+                    encoder,
+                )?);
             }
         }
         work.advance()?;
@@ -350,12 +352,11 @@ fn embed(
         .into_iter()
         .unzip();
     let mut found = found.concat();
-    let object_of = found.iter().map(|mask| mask.label).collect();
     let sharpness = photo_quality::weights(&photo_stats);
     found
         .iter_mut()
         .for_each(|mask: &mut Mask| mask.area *= sharpness[mask.view]);
-    Ok((found, object_of))
+    Ok(found)
 }
 
 /// Returns the map of some objects that share no Gaussians, from the object map of a view. `lists`

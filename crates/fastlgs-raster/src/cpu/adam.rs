@@ -14,7 +14,7 @@ pub fn adam(
 ) {
     let n = 4 * step.quads as usize;
     for channel in step.first_channel as usize..step.end_channel as usize {
-        for k in channel * n..(channel + 1) * n {
+        for k in channel * n + n.min(step.frozen as usize)..(channel + 1) * n {
             adam_one(
                 step,
                 channel,

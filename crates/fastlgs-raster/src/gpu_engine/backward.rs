@@ -167,6 +167,7 @@ pub fn adam(passes: &Training, r: &mut Recorder, g: &Gaussians, step: &Step) -> 
     for page in &g.pages {
         let step = Step {
             quads: stride(page.n) as u32 / 4,
+            frozen: step.frozen.saturating_sub(page.first as u32),
             ..*step
         };
         let (gradients, params, moment1, moment2) =

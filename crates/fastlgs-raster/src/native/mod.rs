@@ -309,15 +309,18 @@ impl CpuEngine {
                         counts[k] += 1.0;
                     }
                 }
+                let first = block * adam::BLOCK;
+                let frozen = width * (step.frozen as usize).saturating_sub(first);
+                let frozen = frozen.min(params.len());
                 adam::update_block(
                     step,
                     width,
                     &rates,
                     adam::Values {
-                        params,
-                        moment1,
-                        moment2,
-                        gradients,
+                        params: &mut params[frozen..],
+                        moment1: &mut moment1[frozen..],
+                        moment2: &mut moment2[frozen..],
+                        gradients: &gradients[frozen..],
                     },
                 );
             },

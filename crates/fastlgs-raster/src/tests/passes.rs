@@ -8,6 +8,7 @@ use crate::pass::{Groups, Pass, Recorder};
 use crate::shader::{Kernel, Shader, shaders};
 use crate::view::{ChunkJob, Plane, Planes, Step, View, stride};
 use crate::{Channels, Gpu};
+use fastlgs_core::gaussians::channel::OPACITY;
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 use fastlgs_core::rng::Rng;
 use std::collections::BTreeMap;
@@ -962,6 +963,7 @@ fn adam() {
         let step = Step {
             quads: stride(n) as u32 / 4,
             opacity_weight: 0.3,
+            frozen: n as u32 / 2,
             ..Step::new(7, 3..channels_of(degree), &rates)
         };
         let [device, twin] = on_device_and_twin(
@@ -980,6 +982,15 @@ fn adam() {
             device[1][..3 * stride(n)],
             params[..3 * stride(n)],
             "channels that are not trained do not change"
+        );
+        let of_opacity = OPACITY * stride(n)..OPACITY * stride(n) + n;
+        let [before, after] = [&params, &device[1]].map(|values| &values[of_opacity.clone()]);
+        assert_eq!(before[..n / 2], after[..n / 2], "frozen");
+        assert!(
+            before[n / 2..]
+                .iter()
+                .zip(&after[n / 2..])
+                .all(|(a, b)| a != b)
         );
     }
 }

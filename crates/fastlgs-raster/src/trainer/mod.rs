@@ -224,6 +224,7 @@ impl Trainer {
         };
         let mut step = Step::new(iteration + 1, trained, &rates);
         step.opacity_weight = config.opacity_weight(iteration, self.engine.len(), self.contrast);
+        step.frozen = config.frozen as u32;
         let left_out = config.dropout(iteration, self.targets.len());
         let view = self
             .view(&camera, degree)

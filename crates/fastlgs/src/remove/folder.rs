@@ -1,8 +1,8 @@
 //! Writes the scene folder of a scene without the removed object.
 
-use crate::SceneNotes;
+use super::{HiddenPixels, embeddings, refine};
 use crate::staged::StagedOutput;
-use crate::{Result, Scene, transparent};
+use crate::{Result, Run, Scene, SceneNotes, transparent};
 use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::evidence::{self, Pairs};
@@ -16,20 +16,18 @@ const NOT_COPIED: [&str; 2] = ["masks/objects", "embeddings.safetensors"];
 /// Share of hidden pixels from which a mask belongs to the removed object.
 const MIN_HIDDEN_SHARE: f64 = 0.5;
 
-/// A view and its hidden pixels: those that the object may have coloured.
-type Hidden = (Camera, Vec<bool>);
-
 /// Writes the scene that `session` holds to `output`. `what` names the removed object in the
 /// manifest.
 ///
-/// In training photos, rendered colours replace the hidden pixels. Held-out photos still show the
-/// object, so their hidden pixels are ignored.
+/// In training photos, rendered colours replace the hidden pixels, and the scene is refined on these
+/// photos. Held-out photos still show the object, so their hidden pixels are ignored.
 pub fn write(
     output: &Path,
     session: &mut Scene,
-    grid: &Grid,
-    views: &[Hidden],
+    grid: &mut Grid,
+    hidden: &HiddenPixels,
     what: &str,
+    run: &Run,
 ) -> Result<()> {
     let scene = SceneFolder::new(output);
     let staged = StagedOutput::new(&scene, "remove")?;
@@ -41,13 +39,15 @@ pub fn write(
     )?;
     let mut manifest = session.manifest().clone();
     let held_out = manifest.held_out(session.cameras());
-    for (camera, hidden) in views {
+    for (camera, hidden) in &hidden.all {
         if held_out.iter().any(|c| c.name == camera.name) {
             ignore_hidden(folder, camera, hidden)?;
         } else {
             replace_hidden(folder, session, camera, hidden)?;
         }
     }
+    refine::refine(session, folder, &hidden.in_training, run)?;
+    embeddings::renew(session, grid, folder, &hidden.in_training, run)?;
     // The masks have other labels now, so the pairs of the original scene are invalid.
     evidence::save_pairs(folder, &Pairs::new())?;
     grid.save(folder)?;
@@ -66,12 +66,7 @@ pub fn write(
         train.clear = transparent::count(session.gaussians());
     }
     notes.store(&mut manifest)?;
-    let maps = session
-        .manifest()
-        .training(session.cameras())
-        .into_iter()
-        .map(|camera| SceneFolder::objects_name(&camera.name));
-    staged.publish(&scene, &[], maps, &manifest)
+    staged.publish(&scene, &[], [], &manifest)
 }
 
 /// Adds the hidden pixels of a held-out view to its ignore mask.

@@ -7,8 +7,11 @@
 //! the gap becomes a Gaussian, which later views contain, so that all views agree on one surface.
 
 mod behind;
+mod embeddings;
+mod fill;
 mod folder;
 mod membrane;
+mod refine;
 
 use crate::error::{Context, bail};
 use crate::output::{SceneLock, resolve_path};
@@ -16,12 +19,12 @@ use crate::query::object_query::ObjectQuery;
 use crate::query::selection;
 use crate::teach::no_object;
 use crate::{Error, Result, Run, Scene, transparent};
-use fastlgs_core::{Camera, SceneFolder, metrics};
+use fastlgs_core::{Camera, Gaussians, SceneFolder, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
 use fastlgs_grid::query::{Hit, QueryConfig};
 use fastlgs_vision::inpaint::{self, Inpainter};
-use glam::Vec2;
+use fill::Filled;
 use membrane::Membrane;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -90,16 +93,6 @@ pub struct RemoveReport {
 
 /// Dilation of masks in x and y, in pixels: five times a window of 5x5 (paper).
 const MASK_DILATION: [u32; 2] = [10; 2];
-/// Opacity of the Gaussians that fill a gap.
-const FILL_OPACITY: f32 = 0.95;
-/// Radius of these Gaussians in pixel spacings at their depth: wide enough to close the space
-/// between neighbours.
-const FILL_RADIUS: f32 = 0.7;
-/// A gap with at most this share of the pixels of a view is not filled.
-const MIN_GAP_SHARE: f64 = 1e-5;
-/// Transmittance above which a pixel is empty.
-const EMPTY_TRANSMITTANCE: f32 = 0.5;
-
 /// Removes the objects that `config` names, fills the gaps, and writes a new scene.
 ///
 /// # Errors
@@ -128,25 +121,17 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
         );
     }
     let removed = scene.gaussians().len() - left.len();
+    let gone = gone_objects(scene.gaussians(), &grid, &objects, &left);
     let rest = scene.gaussians().select(&left);
     scene.set_gaussians(rest)?;
 
-    let mut gaps = Vec::new();
-    for (camera, hidden) in &hidden.in_training {
-        gaps.push(empty_hidden_pixels(&mut scene, camera, hidden)?);
-    }
-    let gap_pixels: usize = gaps.iter().map(|gap| count_set(gap)).sum();
+    let Filled {
+        gaussians,
+        gap_pixels,
+    } = fill::fill(&mut scene, &grid, &hidden.in_training, &*inpainter, run)?;
     let hidden_pixels: usize = hidden.in_training.iter().map(|h| count_set(&h.1)).sum();
-    let filled = fill(
-        &mut scene,
-        &grid,
-        &hidden.in_training,
-        &gaps,
-        &*inpainter,
-        run,
-    )?;
 
-    let (left_over, ids) = grid.without(&objects);
+    let (mut left_over, ids) = grid.without(&gone);
     let renumbered = |id: &u16| ids.get(usize::from(*id)).copied().unwrap_or(0);
     let ids = scene.gaussians().object_ids.iter().map(renumbered);
     let ids = ids.collect();
@@ -155,13 +140,20 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
         .text
         .clone()
         .unwrap_or_else(|| format!("object {}", objects[0]));
-    folder::write(&config.output, &mut scene, &left_over, &hidden.all, &what)?;
+    folder::write(
+        &config.output,
+        &mut scene,
+        &mut left_over,
+        &hidden,
+        &what,
+        run,
+    )?;
     Ok(RemoveReport {
         scene: config.scene.clone(),
         output: config.output.clone(),
         objects,
         removed,
-        filled,
+        filled: gaussians,
         seen: 1.0 - gap_pixels as f64 / (hidden_pixels as f64).max(1.0),
         left: left_over.objects.len(),
     })
@@ -267,6 +259,20 @@ fn remaining(
     Ok((0..remains.len()).filter(|i| remains[*i]).collect())
 }
 
+/// Returns for each object whether it disappears: the removed ones, their parts, and those that lose
+/// more than half of their Gaussians if those in `left` remain.
+fn gone_objects(scene: &Gaussians, grid: &Grid, removed: &[u16], left: &[usize]) -> Vec<bool> {
+    let counts = |scene: &Gaussians| -> Vec<usize> {
+        let by_object = selection::gaussians_by_object(scene, grid);
+        by_object.iter().map(Vec::len).collect()
+    };
+    let remaining = counts(scene).into_iter().zip(counts(&scene.select(left)));
+    let is_gone =
+        |(is_part, (before, after)): (bool, (usize, usize))| is_part || 2 * after < before;
+    let parts = grid.parts(removed).into_iter();
+    parts.zip(remaining).map(is_gone).collect()
+}
+
 fn count_set(pixels: &[bool]) -> usize {
     pixels.iter().filter(|p| **p).count()
 }
@@ -302,82 +308,4 @@ fn targets(config: &RemoveConfig, scene: &mut Scene, grid: &Grid) -> Result<Vec<
         )));
     }
     Ok(found.targets)
-}
-
-/// Renders colours without the share of the background, `[3][h][w]`. At the border of a gap, this
-/// share is up to half of the light.
-fn solid_colors(scene: &mut Scene, camera: &Camera) -> Result<Vec<f32>> {
-    let frame = scene.render(camera)?;
-    let behind = scene.trained().background;
-    let transmittance = frame.transmittance();
-    let solid = |c: usize| {
-        let channel = frame.channels(c, c + 1).iter().zip(transmittance);
-        channel.map(move |(color, t)| {
-            if *t < EMPTY_TRANSMITTANCE {
-                (color - t * behind[c]) / (1.0 - t)
-            } else {
-                *color
-            }
-        })
-    };
-    Ok((0..3).flat_map(solid).collect())
-}
-
-/// Returns the hidden pixels of a view that are empty.
-fn empty_hidden_pixels(scene: &mut Scene, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool>> {
-    let frame = scene.render(camera)?;
-    Ok(hidden
-        .iter()
-        .zip(frame.transmittance())
-        .map(|(hidden, transmittance)| *hidden && *transmittance > EMPTY_TRANSMITTANCE)
-        .collect())
-}
-
-/// Fills the gaps of all views with Gaussians, and returns their number.
-fn fill(
-    scene: &mut Scene,
-    grid: &Grid,
-    views: &[(Camera, Vec<bool>)],
-    gaps: &[Vec<bool>],
-    inpainter: &dyn Inpainter,
-    run: &Run,
-) -> Result<usize> {
-    let before = scene.gaussians().len();
-    let mut order: Vec<usize> = (0..views.len()).collect();
-    order.sort_by_key(|k| std::cmp::Reverse(count_set(&gaps[*k])));
-    let work = run.work("gaps", order.len() as u64);
-    for (camera, hidden) in order.into_iter().map(|k| &views[k]) {
-        work.advance()?;
-        // Other views may have filled a part of this gap.
-        let gap = empty_hidden_pixels(scene, camera, hidden)?;
-        let (n, width) = (gap.len(), camera.width as usize);
-        if count_set(&gap) as f64 <= MIN_GAP_SHARE * n as f64 || count_set(&gap) == n {
-            continue;
-        }
-        let inverse = behind::inverse_depth_behind(&scene.render_depth(camera)?, &gap, width);
-        let mut colors = solid_colors(scene, camera)?;
-        inpainter.fill(&mut colors, &gap, camera.width)?;
-        let ids = membrane::extend_labels(
-            &scene.field_without_transparent(camera)?.ids(grid).labels,
-            &gap,
-            width,
-        );
-        let to_world = camera.world_to_camera.inverse();
-        let mut filled = scene.gaussians().clone();
-        for p in (0..n).filter(|p| gap[*p] && inverse[*p] > 0.0) {
-            let depth = 1.0 / inverse[p];
-            let pixel = Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5);
-            let place = to_world.transform_point3(camera.ray(pixel) * depth);
-            filled.push_sphere(
-                place,
-                FILL_RADIUS * depth / camera.fx,
-                FILL_OPACITY,
-                std::array::from_fn(|c| colors[c * n + p].clamp(0.0, 1.0)),
-            );
-            let last = filled.len() - 1;
-            (filled.object_ids[last], filled.features[last]) = (ids[p], grid.code_of(ids[p]));
-        }
-        scene.set_gaussians(filled)?;
-    }
-    Ok(scene.gaussians().len() - before)
 }

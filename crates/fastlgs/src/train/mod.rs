@@ -19,7 +19,7 @@ use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_raster::Targets;
-pub(crate) use init::target;
+pub(crate) use init::{target, targets};
 use map_objects::MappedObjects;
 pub use report::{CurvePoint, TrainReport};
 use run::Trained;
