@@ -18,50 +18,70 @@ const FILL_OPACITY: f32 = 0.95;
 const FILL_RADIUS: f32 = 0.7;
 /// A gap with at most this share of the pixels of a view is not filled.
 const MIN_GAP_SHARE: f64 = 1e-5;
-/// Transmittance above which a pixel is empty.
-const EMPTY_TRANSMITTANCE: f32 = 0.5;
-/// Transmittance above which depth and colour of a hidden pixel are unknown.
-const UNKNOWN_TRANSMITTANCE: f32 = 0.1;
+/// Transmittance above which a hidden pixel belongs to a gap.
+const EMPTY: f32 = 0.5;
+/// Transmittance above which the colour of a hidden pixel is unknown in a filled photo.
+const UNCERTAIN: f32 = 0.1;
 
 /// Result of filling.
 pub struct Filled {
     /// Number of new Gaussians.
     pub gaussians: usize,
-    /// Number of empty pixels of all views before.
+    /// Number of pixels of the gaps of all views.
     pub gap_pixels: usize,
 }
 
-/// Renders colours without the share of the background, `[3][h][w]`. At the border of a gap, this
-/// share is up to half of the light.
-fn solid_colors(scene: &mut Scene, camera: &Camera) -> Result<Vec<f32>> {
+/// Renders colours, `[3][h][w]`. The inpainter computes those of hidden pixels whose transmittance is
+/// above a limit; the others are without the background's share.
+fn inpainted(
+    scene: &mut Scene,
+    (camera, hidden): &(Camera, Vec<bool>),
+    limit: f32,
+    inpainter: &dyn Inpainter,
+) -> Result<Vec<f32>> {
     let frame = scene.render(camera)?;
     let behind = scene.trained().background;
     let transmittance = frame.transmittance();
     let solid = |c: usize| {
         let channel = frame.channels(c, c + 1).iter().zip(transmittance);
         channel.map(move |(color, t)| {
-            if *t < EMPTY_TRANSMITTANCE {
+            if *t <= limit {
                 (color - t * behind[c]) / (1.0 - t)
             } else {
                 *color
             }
         })
     };
-    Ok((0..3).flat_map(solid).collect())
+    let mut colors: Vec<f32> = (0..3).flat_map(solid).collect();
+    let unknown = hidden_above(hidden, transmittance, limit);
+    if unknown.contains(&true) && unknown.contains(&false) {
+        inpainter.fill(&mut colors, &unknown, camera.width)?;
+    }
+    Ok(colors)
 }
 
-/// Returns the hidden pixels of a view whose transmittance is above a limit.
-fn hidden_above(
+/// Returns the colours of a training view without the object, `[3][h][w]`.
+pub fn photo_colors(
     scene: &mut Scene,
-    camera: &Camera,
-    hidden: &[bool],
-    limit: f32,
-) -> Result<Vec<bool>> {
-    let frame = scene.render(camera)?;
-    let pixels = hidden.iter().zip(frame.transmittance());
-    Ok(pixels
-        .map(|(hidden, transmittance)| *hidden && *transmittance > limit)
-        .collect())
+    view: &(Camera, Vec<bool>),
+    inpainter: &dyn Inpainter,
+) -> Result<Vec<f32>> {
+    inpainted(scene, view, UNCERTAIN, inpainter)
+}
+
+/// Returns which hidden pixels have a transmittance above a limit.
+fn hidden_above(hidden: &[bool], transmittance: &[f32], limit: f32) -> Vec<bool> {
+    let pixels = hidden.iter().zip(transmittance);
+    pixels.map(|(hidden, t)| *hidden && *t > limit).collect()
+}
+
+/// Returns the pixels of a view that belong to a gap.
+fn gap(scene: &mut Scene, (camera, hidden): &(Camera, Vec<bool>)) -> Result<Vec<bool>> {
+    Ok(hidden_above(
+        hidden,
+        scene.render(camera)?.transmittance(),
+        EMPTY,
+    ))
 }
 
 /// Fills the gaps within the hidden pixels of `views`, the training views.
@@ -74,28 +94,25 @@ pub fn fill(
 ) -> Result<Filled> {
     let before = scene.gaussians().len();
     let mut gap_sizes = Vec::new();
-    for (camera, hidden) in views {
-        let gap = hidden_above(scene, camera, hidden, EMPTY_TRANSMITTANCE)?;
-        gap_sizes.push(count_set(&gap));
+    for view in views {
+        gap_sizes.push(count_set(&gap(scene, view)?));
     }
     let mut order: Vec<usize> = (0..views.len()).collect();
     order.sort_by_key(|k| std::cmp::Reverse(gap_sizes[*k]));
     let work = run.work("gaps", order.len() as u64);
-    for (camera, hidden) in order.into_iter().map(|k| &views[k]) {
+    for view in order.into_iter().map(|k| &views[k]) {
         work.advance()?;
         // Other views may have filled a part of this gap.
-        let gap = hidden_above(scene, camera, hidden, EMPTY_TRANSMITTANCE)?;
+        let (camera, gap) = (&view.0, gap(scene, view)?);
         let (n, width) = (gap.len(), camera.width as usize);
         if count_set(&gap) as f64 <= MIN_GAP_SHARE * n as f64 || count_set(&gap) == n {
             continue;
         }
-        let unknown = hidden_above(scene, camera, hidden, UNKNOWN_TRANSMITTANCE)?;
-        let inverse = behind::inverse_depth_behind(&scene.render_depth(camera)?, &unknown, width);
-        let mut colors = solid_colors(scene, camera)?;
-        inpainter.fill(&mut colors, &unknown, camera.width)?;
+        let inverse = behind::inverse_depth_behind(&scene.render_depth(camera)?, &gap, width);
+        let colors = inpainted(scene, view, EMPTY, inpainter)?;
         let ids = membrane::extend_labels(
             &scene.field_without_transparent(camera)?.ids(grid).labels,
-            &unknown,
+            &gap,
             width,
         );
         let to_world = camera.world_to_camera.inverse();

@@ -1,11 +1,12 @@
 //! Writes the scene folder of a scene without the removed object.
 
-use super::{HiddenPixels, embeddings, refine};
+use super::{HiddenPixels, embeddings, fill, refine};
 use crate::staged::StagedOutput;
 use crate::{Result, Run, Scene, SceneNotes, transparent};
 use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::evidence::{self, Pairs};
+use fastlgs_vision::inpaint::Inpainter;
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -19,7 +20,7 @@ const MIN_HIDDEN_SHARE: f64 = 0.5;
 /// Writes the scene that `session` holds to `output`. `what` names the removed object in the
 /// manifest.
 ///
-/// In training photos, rendered colours replace the hidden pixels, and the scene is refined on these
+/// In training photos, rendered and inpainted colours replace the hidden pixels, and the scene is refined on these
 /// photos. Held-out photos still show the object, so their hidden pixels are ignored.
 pub fn write(
     output: &Path,
@@ -27,6 +28,7 @@ pub fn write(
     grid: &mut Grid,
     hidden: &HiddenPixels,
     what: &str,
+    inpainter: &dyn Inpainter,
     run: &Run,
 ) -> Result<()> {
     let scene = SceneFolder::new(output);
@@ -39,11 +41,12 @@ pub fn write(
     )?;
     let mut manifest = session.manifest().clone();
     let held_out = manifest.held_out(session.cameras());
-    for (camera, hidden) in &hidden.all {
-        if held_out.iter().any(|c| c.name == camera.name) {
-            ignore_hidden(folder, camera, hidden)?;
+    for view in &hidden.all {
+        if held_out.iter().any(|c| c.name == view.0.name) {
+            ignore_hidden(folder, &view.0, &view.1)?;
         } else {
-            replace_hidden(folder, session, camera, hidden)?;
+            let colors = fill::photo_colors(session, view, inpainter)?;
+            replace_hidden(folder, view, &colors)?;
         }
     }
     refine::refine(session, folder, &hidden.in_training, run)?;
@@ -84,17 +87,16 @@ fn ignore_hidden(folder: &SceneFolder, camera: &Camera, hidden: &[bool]) -> Resu
     Ok(image_io::save_png(&path, mask)?)
 }
 
-/// Replaces the hidden pixels of a training photo by rendered colours, and removes the masks of the
-/// object.
+/// Replaces the hidden pixels of a training photo by `colors`, `[3][h][w]`, and removes the masks of
+/// the object.
 fn replace_hidden(
     folder: &SceneFolder,
-    scene: &mut Scene,
-    camera: &Camera,
-    hidden: &[bool],
+    (camera, hidden): &(Camera, Vec<bool>),
+    colors: &[f32],
 ) -> Result<()> {
     let mut photo = folder.photo(&camera.name)?;
     let counts = pixels_that_count(folder, &camera.name, hidden.len())?;
-    patch(&mut photo, hidden, &counts, scene.render(camera)?.color());
+    patch(&mut photo, hidden, &counts, colors);
     image_io::save_png(&folder.photo_path(&camera.name), photo)?;
     let path = folder.masks_path(&camera.name);
     if !path.is_file() {

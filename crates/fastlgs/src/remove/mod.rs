@@ -146,6 +146,7 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
         &mut left_over,
         &hidden,
         &what,
+        &*inpainter,
         run,
     )?;
     Ok(RemoveReport {
