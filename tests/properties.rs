@@ -221,7 +221,7 @@ proptest! {
             prop_assert_eq!(related[usize::from(other) - 1], grid.related(other)[usize::from(picked_id) - 1], "{} and {}", picked_id, other);
         }
         let gone = grid.parts(&[picked_id]);
-        let (left, new) = grid.without(&[picked_id]);
+        let (left, new) = grid.without(&grid.parts(&[picked_id]));
         let stay: Vec<u16> = (1..=count).filter(|id| !gone[usize::from(*id) - 1]).collect();
         for (id, list) in ids.iter().zip(&lists) {
             let after: Vec<u16> = left.chain(new[usize::from(*id)]).map(|id| stay[usize::from(id) - 1]).collect();

@@ -190,6 +190,7 @@ mod tests {
     use super::*;
     use crate::observations::Observation;
     use crate::support::ViewSupport;
+    use std::collections::BTreeSet;
 
     /// Returns the objects of sets of 20 Gaussians with these supports. Each Gaussian covers 100
     /// pixels in each of four views of 10,000.

@@ -120,9 +120,8 @@ class TrainOptions(TypedDict, total=False):
     # rounded up to a multiple of 20
     curve: int
 
-    # Weight of the depth loss, which keeps Gaussians on surfaces where photos have no texture;
-    # 0 for none. It is multiplied by the square of the share of the photos without texture. 1.5
-    # suits rooms with bare walls
+    # Weight of the depth loss, which keeps Gaussians on the planes that masks show; 0 for none.
+    # It is used if at least 40 % of the photos have no texture, as in rooms with bare walls
     depth_weight: float
 
     # Learn an affine exposure for each training photo. `auto` does so if the photos' brightness
