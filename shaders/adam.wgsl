@@ -48,8 +48,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         }
         let m1 = 0.9 * moment1[k] + 0.1 * g;
         let m2 = 0.999 * moment2[k] + 0.001 * g * g;
-        moment1[k] = m1;
-        moment2[k] = m2;
+        moment1[k] = select(moment1[k], m1, moves);
+        moment2[k] = select(moment2[k], m2, moves);
         let next = value - rate * (m1 / step.correction1) / (sqrt(m2 / step.correction2) + step.epsilon);
         // Codes lie in (0, 1)^3 (paper). Without the clamp, a nearly invisible Gaussian would leave
         // this range to compensate others.
