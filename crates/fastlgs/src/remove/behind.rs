@@ -21,35 +21,35 @@ const DEPTH_BEYOND: f32 = 0.5;
 /// one: fur at its border, and parts that few photos show. `views` holds the hidden pixels of each
 /// training view, `object` the indices of the object's Gaussians.
 ///
-/// A view counts for a Gaussian if its centre is within the hidden pixels, not far behind the
-/// object, and before the surface that continues the depth around the hidden pixels. A view that
-/// shows the centre beside them counts against it.
+/// Most views that see the place of such a Gaussian have it within the hidden pixels, not far behind
+/// the object, and before the surface that continues the depth around the hidden pixels.
 pub fn protruding_gaussians(
     scene: &mut Scene,
     object: &[usize],
     views: &[(Camera, Vec<bool>)],
 ) -> Result<Vec<usize>> {
-    let mut balance = vec![0i32; scene.gaussians().len()];
+    // Views that see the place of a Gaussian, and those that have it at the object's place.
+    let mut counts = vec![[0u32; 2]; scene.gaussians().len()];
     for (camera, hidden) in views {
         let depth = scene.render_depth(camera)?;
         let behind = inverse_depth_behind(&depth, hidden, camera.width as usize);
         let means = &scene.gaussians().means;
         let far = far_side(camera, object.iter().map(|i| means[*i]));
-        for (mean, balance) in means.iter().zip(&mut balance) {
+        for (mean, [seen, at_object]) in means.iter().zip(&mut counts) {
             let Some((pixel, z)) = camera.pixel_and_depth(*mean) else {
                 continue;
             };
-            if hidden[pixel] {
-                let stands_before = z * behind[pixel] < 1.0 - DEPTH_MARGIN;
-                *balance += i32::from(stands_before && z <= far);
-            } else if z < depth[pixel] * (1.0 + DEPTH_MARGIN) {
-                *balance -= 1;
-            }
+            let stands_before = z * behind[pixel] < 1.0 - DEPTH_MARGIN;
+            *seen += 1;
+            *at_object += u32::from(hidden[pixel] && stands_before && z <= far);
         }
     }
     let scene = scene.gaussians();
-    let protrudes = |i: &usize| balance[*i] > 0 && !transparent::is_transparent(scene, *i);
-    Ok((0..balance.len()).filter(protrudes).collect())
+    let protrudes = |i: &usize| {
+        let [seen, at_object] = counts[*i];
+        2 * at_object > seen && !transparent::is_transparent(scene, *i)
+    };
+    Ok((0..counts.len()).filter(protrudes).collect())
 }
 
 /// Returns the largest depth at which Gaussians may belong to an object.

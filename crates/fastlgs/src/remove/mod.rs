@@ -93,6 +93,9 @@ pub struct RemoveReport {
 
 /// Dilation of masks in x and y, in pixels: five times a window of 5x5 (paper).
 const MASK_DILATION: [u32; 2] = [10; 2];
+/// Dilation of the masks of Gaussians that belong to no object: a window of 5x5.
+const EXTENSION_DILATION: [u32; 2] = [2; 2];
+
 /// Removes the objects that `config` names, fills the gaps, and writes a new scene.
 ///
 /// # Errors
@@ -110,9 +113,14 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
     let grid = scene.grid()?;
     let targets = targets(config, &mut scene, &grid)?;
     let objects: Vec<u16> = targets.iter().map(|t| t.id).collect();
-    let hidden = HiddenPixels::of(&mut scene, &grid, &targets)?;
+    let mut hidden = HiddenPixels::of(&mut scene, &grid, &targets, MASK_DILATION)?;
     extend_object(&mut scene, &grid, &objects, &hidden)?;
-    let hidden = HiddenPixels::of(&mut scene, &grid, &targets)?;
+    hidden.extend(HiddenPixels::of(
+        &mut scene,
+        &grid,
+        &targets,
+        EXTENSION_DILATION,
+    )?);
     let left = remaining(&mut scene, &grid, &objects, &hidden)?;
     if left.is_empty() {
         bail!(
@@ -193,7 +201,7 @@ fn open_with_photos(config: &RemoveConfig, run: &Run) -> Result<Scene> {
     Ok(scene)
 }
 
-/// Pixels of the views that the removed objects cover, widened by `MASK_DILATION`.
+/// Pixels of the views that the removed objects cover, and those near them.
 struct HiddenPixels {
     /// All views.
     all: Vec<(Camera, Vec<bool>)>,
@@ -202,14 +210,15 @@ struct HiddenPixels {
 }
 
 impl HiddenPixels {
-    fn of(scene: &mut Scene, grid: &Grid, targets: &[Hit]) -> Result<Self> {
+    /// `dilation` is in pixels in x and y.
+    fn of(scene: &mut Scene, grid: &Grid, targets: &[Hit], dilation: [u32; 2]) -> Result<Self> {
         let training = scene.manifest().training(scene.cameras());
         let has_transparent = scene.trained().clear > 0;
         let (mut all, mut in_training) = (Vec::new(), Vec::new());
         for camera in scene.cameras().to_vec() {
             let widened = |field: &Field| {
                 let mask = field.mask(grid, targets);
-                metrics::dilate(&mask, camera.width, camera.height, MASK_DILATION)
+                metrics::dilate(&mask, camera.width, camera.height, dilation)
             };
             let hidden = widened(&*scene.field(&camera, None)?);
             if training.iter().any(|view| view.name == camera.name) {
@@ -223,6 +232,15 @@ impl HiddenPixels {
             all.push((camera, hidden));
         }
         Ok(Self { all, in_training })
+    }
+
+    /// Adds the pixels of `other`, which has the same views.
+    fn extend(&mut self, other: Self) {
+        let views = self.all.iter_mut().chain(&mut self.in_training);
+        let added = other.all.into_iter().chain(other.in_training);
+        for ((_, hidden), (_, added)) in views.zip(added) {
+            hidden.iter_mut().zip(added).for_each(|(h, a)| *h |= a);
+        }
     }
 }
 
