@@ -159,7 +159,8 @@ class TrainOptions(TypedDict, total=False):
     # like-paper
     sh_degree: int
 
-    # Global mapping: least support of an object, its mean IoU with the best mask of each view
+    # Global mapping: least support of an object, its mean IoU with the best mask of each view,
+    # by default 0.3 for imported masks and 0.5 for others
     support: float
 
     # Paper mapping: least number of key point matches that makes two masks one object

@@ -145,6 +145,10 @@ impl Background {
 /// object can be as low as 0.6 (median 0.87). With CLIP, it is rarely below 0.9.
 const OFFLINE_THETA: f32 = 0.7;
 
+/// Default least support of objects if their masks are imported. Such masks are mostly exact, and what
+/// lowers the support of an object is thin parts and Gaussians beside it (docs/research/rooms.md).
+const IMPORTED_SUPPORT: f32 = 0.3;
+
 /// Default weight of the feature loss relative to the colour loss. The paper gives no value. Wrong
 /// masks displace Gaussians: on the scene "fox", a weight of 1 lowers PSNR by 2.3 dB, and this
 /// weight lowers it by 0.1 dB.
@@ -256,9 +260,10 @@ pub struct TrainConfig {
         )
     )]
     pub cues: Vec<Cue>,
-    /// Global mapping: least support of an object, its mean IoU with the best mask of each view.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = chosen::SelectionConfig::default().min_support))]
-    pub support: f32,
+    /// Global mapping: least support of an object, its mean IoU with the best mask of each view, by
+    /// default 0.3 for imported masks and 0.5 for others.
+    #[cfg_attr(feature = "clap", arg(long))]
+    pub support: Option<f32>,
     /// Measure the PSNR of held-out views every N iterations, and report it over time. N is rounded
     /// up to a multiple of 20.
     #[cfg_attr(feature = "clap", arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..)))]
@@ -278,7 +283,7 @@ pub struct TrainConfig {
 
 impl Default for TrainConfig {
     fn default() -> Self {
-        let (paper, objects) = (PaperConfig::default(), chosen::SelectionConfig::default());
+        let paper = PaperConfig::default();
         Self {
             scene: PathBuf::new(),
             preset: Preset::default(),
@@ -298,7 +303,7 @@ impl Default for TrainConfig {
             theta: None,
             alpha: paper.alpha,
             cues: vec![Cue::Keypoints, Cue::Color],
-            support: objects.min_support,
+            support: None,
             curve: None,
             feature_weight: FEATURE_WEIGHT,
             depth_weight: DEPTH_WEIGHT,
@@ -389,12 +394,18 @@ impl TrainConfig {
             && !self.freeze
     }
 
-    /// Returns the constants of global mapping.
-    pub(super) fn global(&self) -> objects::MappingConfig {
+    /// Returns the constants of global mapping of masks by this segmenter.
+    pub(super) fn global(&self, segmenter: &str) -> objects::MappingConfig {
+        let is_imported = segmenter == SegmenterKind::Import.name();
+        let default = if is_imported {
+            IMPORTED_SUPPORT
+        } else {
+            chosen::SelectionConfig::default().min_support
+        };
         objects::MappingConfig {
             antialias: self.antialias,
             objects: chosen::SelectionConfig {
-                min_support: self.support,
+                min_support: self.support.unwrap_or(default),
                 ..chosen::SelectionConfig::default()
             },
         }

@@ -27,7 +27,7 @@ pub fn map_objects(inputs: &Inputs, trained: &mut Trained, run: &Run) -> Result<
     let mut mapper = objects::Mapper {
         folder: &inputs.folder,
         cameras: training,
-        config: inputs.config.global(),
+        config: inputs.config.global(&inputs.manifest.segmenter),
         engine: &mut **engine,
         run,
     };

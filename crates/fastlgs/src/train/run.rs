@@ -119,7 +119,7 @@ fn initial_gaussians(
         let mut mapper = objects::Mapper {
             folder: &inputs.folder,
             cameras: &inputs.training,
-            config: config.global(),
+            config: config.global(&inputs.manifest.segmenter),
             engine,
             run,
         };
@@ -176,7 +176,7 @@ impl ProgressWatcher<'_> {
         let (iteration, seconds, psnr, gaussians) = (*iteration, *seconds, *psnr, *gaussians);
         if self.settings.couples_at == Some(iteration) {
             let started = Instant::now();
-            let config = self.inputs.config.global();
+            let config = self.inputs.config.global(&self.inputs.manifest.segmenter);
             mask_supervision::begin(trainer, &self.inputs.folder, config, self.run)?;
             self.supervision_seconds += started.elapsed().as_secs_f64();
         }
