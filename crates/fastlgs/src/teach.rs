@@ -2,14 +2,14 @@
 
 use crate::error::{Context, bail};
 use crate::names::{Example, Names, normalise_name};
-use crate::query::Pixels;
 use crate::query::object_query::{ObjectQuery, picture_query};
+use crate::query::{Pixels, selection};
 use crate::{Error, Result, Run, Scene, model_choice};
 use fastlgs_core::image_io;
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::QueryConfig;
 use serde::{Deserialize, Serialize};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// A name and one example: `point` (with `view`), `object` or `image`.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -91,7 +91,7 @@ pub fn teach_object(scene: &Scene, grid: &Grid, name: &str, id: u16) -> Result<T
     let object = usize::from(id)
         .checked_sub(1)
         .and_then(|k| grid.objects.get(k));
-    let object = object.ok_or_else(|| no_object(&scene.folder().root, grid, id))?;
+    let object = object.ok_or_else(|| selection::no_object(&scene.folder().root, grid, id))?;
     store_example(
         scene,
         name,
@@ -99,15 +99,6 @@ pub fn teach_object(scene: &Scene, grid: &Grid, name: &str, id: u16) -> Result<T
         format!("object {id} of {root}"),
         object.embeddings.clone(),
     )
-}
-
-/// Returns the error for an object id that the scene in `root` does not have.
-pub(crate) fn no_object(root: &Path, grid: &Grid, id: u16) -> Error {
-    Error::NotFound(format!(
-        "{}: its object ids are 1 to {}, and none is {id}; choose one of them",
-        root.display(),
-        grid.objects.len()
-    ))
 }
 
 fn store_example(

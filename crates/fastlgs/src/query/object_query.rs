@@ -1,8 +1,7 @@
 //! Queries by text, picture or pixels of a view, and the objects that they select.
 
-use super::{Pixels, Texts, phrase, texts};
+use super::{Pixels, Texts, phrase, selection, texts};
 use crate::error::{Context, bail};
-use crate::teach::no_object;
 use crate::{Result, Scene};
 use fastlgs_core::{Camera, LabelMap};
 use fastlgs_grid::Grid;
@@ -63,7 +62,7 @@ impl ObjectQuery {
             Self::Object(id) => {
                 let grid = scene.grid()?;
                 if !(1..=grid.objects.len()).contains(&usize::from(*id)) {
-                    return Err(no_object(&scene.folder().root, &grid, *id));
+                    return Err(selection::no_object(&scene.folder().root, &grid, *id));
                 }
                 EmbeddedQuery::Object(*id)
             }

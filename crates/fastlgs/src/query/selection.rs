@@ -1,13 +1,22 @@
 //! Selects the Gaussians of an answer, and exports them.
 
-use crate::Result;
 use crate::error::{Context, bail};
+use crate::{Error, Result};
 use fastlgs_core::camera::mean_up;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, WorldFrame, glb, ply, sog, spz};
 use fastlgs_grid::Grid;
 use glam::Vec3;
 use std::path::Path;
+
+/// Returns the error for an object id that the scene in `root` does not have.
+pub(crate) fn no_object(root: &Path, grid: &Grid, id: u16) -> Error {
+    Error::NotFound(format!(
+        "{}: its object ids are 1 to {}, and none is {id}; choose one of them",
+        root.display(),
+        grid.objects.len()
+    ))
+}
 
 /// Returns the indices of all Gaussians that belong to at least one of `objects`.
 pub fn gaussians(scene: &Gaussians, grid: &Grid, objects: &[u16]) -> Vec<usize> {

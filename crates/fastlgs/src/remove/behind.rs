@@ -9,7 +9,6 @@ use glam::Vec3;
 const MIN_VIEWS: u8 = 2;
 /// Least sum of blending weights of a Gaussian in such a view, in pixels.
 const MIN_SEEN_WEIGHT: f32 = 0.5;
-
 /// Relative depth difference from which a Gaussian stands before or behind a surface.
 const DEPTH_MARGIN: f32 = 0.03;
 /// Share of the nearest and farthest Gaussians of an object that may be outliers.

@@ -4,7 +4,8 @@
 //! inpainter computes its colours. Each pixel of the gap becomes a Gaussian, which later views
 //! contain, so that all views agree on one surface.
 
-use super::{behind, count_set, membrane};
+use super::hidden::count_set;
+use super::{behind, membrane};
 use crate::{Result, Run, Scene};
 use fastlgs_core::Camera;
 use fastlgs_grid::Grid;

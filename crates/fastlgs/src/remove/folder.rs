@@ -1,6 +1,7 @@
 //! Writes the scene folder of a scene without the removed object.
 
-use super::{HiddenPixels, embeddings, fill, refine};
+use super::hidden::HiddenPixels;
+use super::{embeddings, fill, refine};
 use crate::staged::StagedOutput;
 use crate::{Result, Run, Scene, SceneNotes, transparent};
 use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};

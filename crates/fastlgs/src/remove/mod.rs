@@ -2,14 +2,14 @@
 //! inpainting).
 //!
 //! Where other photos show the surface behind the object, it appears once the Gaussians of the
-//! object are gone. Gaps that no photo shows are filled view by view, the largest gap first.
-//! Inverse depth is continued into the gap, and an inpainter computes its colours. Each pixel of
-//! the gap becomes a Gaussian, which later views contain, so that all views agree on one surface.
+//! object are gone. Gaps that no photo shows are filled, and the Gaussians around them are trained on
+//! the filled photos.
 
 mod behind;
 mod embeddings;
 mod fill;
 mod folder;
+mod hidden;
 mod membrane;
 mod refine;
 
@@ -17,14 +17,13 @@ use crate::error::{Context, bail};
 use crate::output::{SceneLock, resolve_path};
 use crate::query::object_query::ObjectQuery;
 use crate::query::selection;
-use crate::teach::no_object;
 use crate::{Error, Result, Run, Scene, transparent};
-use fastlgs_core::{Camera, Gaussians, SceneFolder, metrics};
+use fastlgs_core::{Camera, Gaussians, SceneFolder};
 use fastlgs_grid::Grid;
-use fastlgs_grid::field::Field;
 use fastlgs_grid::query::{Hit, QueryConfig};
 use fastlgs_vision::inpaint::{self, Inpainter};
 use fill::Filled;
+use hidden::{HiddenPixels, count_set};
 use membrane::Membrane;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -201,49 +200,6 @@ fn open_with_photos(config: &RemoveConfig, run: &Run) -> Result<Scene> {
     Ok(scene)
 }
 
-/// Pixels of the views that the removed objects cover, and those near them.
-struct HiddenPixels {
-    /// All views.
-    all: Vec<(Camera, Vec<bool>)>,
-    /// The training views. A transparent object does not hide the surface behind it.
-    in_training: Vec<(Camera, Vec<bool>)>,
-}
-
-impl HiddenPixels {
-    /// `dilation` is in pixels in x and y.
-    fn of(scene: &mut Scene, grid: &Grid, targets: &[Hit], dilation: [u32; 2]) -> Result<Self> {
-        let training = scene.manifest().training(scene.cameras());
-        let has_transparent = scene.trained().clear > 0;
-        let (mut all, mut in_training) = (Vec::new(), Vec::new());
-        for camera in scene.cameras().to_vec() {
-            let widened = |field: &Field| {
-                let mask = field.mask(grid, targets);
-                metrics::dilate(&mask, camera.width, camera.height, dilation)
-            };
-            let hidden = widened(&*scene.field(&camera, None)?);
-            if training.iter().any(|view| view.name == camera.name) {
-                let opaque = if has_transparent {
-                    widened(&scene.field_without_transparent(&camera)?)
-                } else {
-                    hidden.clone()
-                };
-                in_training.push((camera.clone(), opaque));
-            }
-            all.push((camera, hidden));
-        }
-        Ok(Self { all, in_training })
-    }
-
-    /// Adds the pixels of `other`, which has the same views.
-    fn extend(&mut self, other: Self) {
-        let views = self.all.iter_mut().chain(&mut self.in_training);
-        let added = other.all.into_iter().chain(other.in_training);
-        for ((_, hidden), (_, added)) in views.zip(added) {
-            hidden.iter_mut().zip(added).for_each(|(h, a)| *h |= a);
-        }
-    }
-}
-
 /// Gives the first of `objects` the Gaussians that stand where they are.
 fn extend_object(
     scene: &mut Scene,
@@ -292,10 +248,6 @@ fn gone_objects(scene: &Gaussians, grid: &Grid, removed: &[u16], left: &[usize])
     parts.zip(remaining).map(is_gone).collect()
 }
 
-fn count_set(pixels: &[bool]) -> usize {
-    pixels.iter().filter(|p| **p).count()
-}
-
 /// Returns the objects that `config` names.
 ///
 /// # Errors
@@ -304,7 +256,7 @@ fn targets(config: &RemoveConfig, scene: &mut Scene, grid: &Grid) -> Result<Vec<
     let root = config.scene.display();
     if let Some(id) = config.object {
         if id == 0 || usize::from(id) > grid.objects.len() {
-            return Err(no_object(&config.scene, grid, id));
+            return Err(selection::no_object(&config.scene, grid, id));
         }
         return Ok(vec![Hit { id, score: 1.0 }]);
     }
