@@ -88,6 +88,7 @@ fn grid(parents: &[u16]) -> Grid {
         embeddings: Vec::new(),
         areas: Vec::new(),
         views: 3,
+        detected: None,
     };
     Grid {
         objects: parents.iter().enumerate().map(object).collect(),

@@ -429,7 +429,7 @@ fn samples(rooms: &[&Room], names: &Names) -> Samples {
             let query = names.query(name, calibration);
             let margins = room.grid.objects.iter();
             let mut margins: Vec<f32> = margins
-                .filter_map(|object| query::margin(object, &query))
+                .filter_map(|object| evidence::margin(object, &query))
                 .collect();
             margins.sort_by(|a, b| b.total_cmp(a));
             samples.add_name(margins[0], &margins[1..]);
@@ -457,7 +457,7 @@ fn picture_samples(rooms: &[Room], names: &Names) -> Samples {
             let others = objects.iter().filter(|other| other.id != object.id);
             let query = query(object);
             let mut margins: Vec<f32> = others
-                .filter_map(|other| query::margin(other, &query))
+                .filter_map(|other| evidence::margin(other, &query))
                 .collect();
             margins.sort_by(|a, b| b.total_cmp(a));
             samples.add_name(margins[0], &margins[1..]);

@@ -128,6 +128,7 @@ mod tests {
             embeddings: Vec::new(),
             areas: Vec::new(),
             views: 1,
+            detected: None,
         };
         Grid {
             objects: codes.iter().enumerate().map(object).collect(),

@@ -7,6 +7,7 @@ use fastlgs_core::scene_folder::{embedding_encoder, parse_tensors, save_embeddin
 use fastlgs_core::{Error, Gaussians, SceneFolder, fs};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// One object.
@@ -27,6 +28,8 @@ pub struct Object {
     pub areas: Vec<f32>,
     /// Number of views that show it.
     pub views: usize,
+    /// Votes of the detector by class, 0 to 1: the mean over its views. `None` without detector.
+    pub detected: Option<BTreeMap<String, f32>>,
 }
 
 /// All objects of a scene.
@@ -55,6 +58,8 @@ struct Row {
     /// Index of the first of its `count` rows in the embedding table.
     first: usize,
     count: usize,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    detected: Option<BTreeMap<String, f32>>,
 }
 
 /// An object is a part of another one if more than this share of its area lies in the other one.
@@ -95,6 +100,7 @@ impl Grid {
                     embeddings: seen.iter().map(|m| m.embedding.clone()).collect(),
                     areas: seen.iter().map(|m| m.area).collect(),
                     views,
+                    detected: None,
                 }
             })
             .collect();
@@ -102,6 +108,11 @@ impl Grid {
             objects,
             ..Self::default()
         }
+    }
+
+    /// Returns whether the detector voted for objects.
+    pub fn has_detections(&self) -> bool {
+        self.objects.iter().any(|object| object.detected.is_some())
     }
 
     /// Iterates over the objects of an id, smallest first: an object and its ancestors, or the
@@ -324,6 +335,7 @@ impl Grid {
                 views: o.views,
                 first: areas.len(),
                 count: o.areas.len(),
+                detected: o.detected.clone(),
             });
             embeddings.extend(o.embeddings.iter().flatten().copied());
             areas.extend(&o.areas);
@@ -413,6 +425,7 @@ impl Grid {
                         .collect(),
                     areas: areas.1[range].to_vec(),
                     views: r.views,
+                    detected: r.detected,
                 })
             })
             .collect::<Result<Vec<_>, Error>>()?;

@@ -3,7 +3,7 @@
 //! Masks become objects by the paper's Algorithm 1 ([`mapping`]) or by global mapping
 //! ([`consensus`], [`election`], [`support`], [`objects`]).
 //! Each object has a low-dimensional code ([`codes`]) and the embeddings of its masks ([`grid`]).
-//! A text query finds its objects by [`relevancy`] and [`query`].
+//! A text query finds its objects by [`relevancy`], [`evidence`] and [`query`].
 
 pub mod calibration;
 pub mod codebook;
@@ -16,6 +16,7 @@ pub mod field;
 pub mod grid;
 pub mod hull;
 pub mod mapping;
+pub mod mask_pairs;
 pub mod objects;
 pub mod observations;
 pub mod overlaps;

@@ -1,6 +1,7 @@
 //! Selects the objects that answer a query (paper, querying features).
 
 use crate::calibration::Best;
+use crate::evidence::{Evidence, evidence, margin};
 use crate::grid::{Grid, Object};
 use crate::relevancy::{Rule, TextQuery};
 use serde::{Deserialize, Serialize};
@@ -43,92 +44,6 @@ pub struct Hit {
     pub score: f32,
 }
 
-/// Evidence of a query for one object.
-#[derive(Clone, Copy, Debug)]
-pub struct Evidence {
-    /// Log-odds that the query means this object, up to a constant: calibrated margin plus the
-    /// logarithm of its share of the surface.
-    pub rank: f32,
-    /// Calibrated margin: log-odds without the share of the surface.
-    pub calibrated_margin: f32,
-    /// Share of absent names whose best margin is smaller than this object's, 0 to 1.
-    pub score: f32,
-    /// Standard error of rank and calibrated margin over the object's views.
-    pub error: f32,
-}
-
-/// Returns the evidence of a query for each object, in order of id.
-///
-/// By Bayes, rank = temperature * margin + ln(max(min(f, 1 - f), 1 / n)). The margin is cosine minus
-/// canonical cosine, f the object's share of the scene's surface, and n the number of objects. The
-/// temperature comes from the [`crate::calibration::Calibration`].
-///
-/// The margin is the linear discriminant of both cosines: some objects are near to all texts, and
-/// the difference cancels that. Between the objects of a room, the regression of a text's cosine on
-/// the canonical cosine has a slope of 0.90 (`fastlgs-bench clip`). Without canonical phrases, the
-/// margin ranks like the cosine.
-///
-/// With the prior f, small fragments need a larger margin, because there are many of them. Objects
-/// that cover more than half of the scene have the prior `1 - f`, because a name separates an
-/// object from the rest. Objects with less than an equal share get the prior `1 / n`.
-///
-/// The score depends on the margin alone: the object with the largest margin decides whether the
-/// query is answered.
-///
-/// With [`Rule::Paper`], rank and score are the relevancy instead.
-///
-/// Objects without embeddings, or at least as near to a negative as to the query, have rank -inf
-/// and score 0. The object that gave the example has rank inf and score 1.
-pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
-    let calibration = &query.calibration;
-    let (shares, equal) = (grid.shares(), 1.0 / grid.objects.len().max(1) as f32);
-    let seen = grid.objects.iter().filter(|object| is_seen(object)).count();
-    let of_object = |(object, share): (&Object, f32)| {
-        let Some(margin) = margin(object, query) else {
-            return Evidence {
-                rank: f32::NEG_INFINITY,
-                calibrated_margin: f32::NEG_INFINITY,
-                score: 0.0,
-                error: 0.0,
-            };
-        };
-        if query.from_example && object.embeddings.iter().all(|e| query.positive.contains(e)) {
-            return Evidence {
-                rank: f32::INFINITY,
-                calibrated_margin: f32::INFINITY,
-                score: 1.0,
-                error: 0.0,
-            };
-        }
-        if query.rule == Rule::Paper {
-            return paper_evidence(object, query);
-        }
-        let calibrated_margin = calibration.temperature * margin;
-        let variance = mean_over_views(object, |e| (query.margin(e) - margin).powi(2))
-            / object.embeddings.len() as f32;
-        Evidence {
-            rank: calibrated_margin + share.min(1.0 - share).max(equal).ln(),
-            calibrated_margin,
-            score: calibration.confidence(margin, seen),
-            error: calibration.temperature * variance.sqrt(),
-        }
-    };
-    grid.objects.iter().zip(shares).map(of_object).collect()
-}
-
-/// Returns the evidence for an object by the paper's rule: rank and score are the largest relevancy
-/// of its embeddings. The error is 0, so that only the first object is a target.
-fn paper_evidence(object: &Object, query: &TextQuery) -> Evidence {
-    let relevancies = object.embeddings.iter().map(|e| query.relevancy(e));
-    let relevancy = relevancies.fold(0.0, f32::max);
-    Evidence {
-        rank: relevancy,
-        calibrated_margin: relevancy,
-        score: relevancy,
-        error: 0.0,
-    }
-}
-
 /// Returns the largest margin of the objects; `None` if fewer than two objects have one.
 pub fn best(grid: &Grid, query: &TextQuery) -> Option<Best> {
     let margins: Vec<f32> = grid
@@ -156,37 +71,6 @@ pub fn best_of(margins: &[f32]) -> Option<Best> {
         halves_margin: 0.5 * (even + odd),
         objects: margins.len(),
     })
-}
-
-/// Returns the mean of `of` over an object's embeddings, weighted by mask area; 0 without
-/// embeddings.
-fn mean_over_views(object: &Object, of: impl Fn(&[f32]) -> f32) -> f32 {
-    let total: f32 = object.areas.iter().sum();
-    object
-        .embeddings
-        .iter()
-        .zip(&object.areas)
-        .map(|(e, area)| area / total.max(f32::MIN_POSITIVE) * of(e))
-        .sum()
-}
-
-/// Returns whether an object has embeddings.
-fn is_seen(object: &Object) -> bool {
-    !object.embeddings.is_empty() && object.areas.iter().sum::<f32>() > 0.0
-}
-
-/// Returns whether an object is at least as near to a negative as to the query.
-fn is_negative(object: &Object, query: &TextQuery) -> bool {
-    mean_over_views(object, |e| query.negative(e)) >= mean_over_views(object, |e| query.cosine(e))
-}
-
-/// Returns an object's margin: the mean of [`TextQuery::margin`] over its embeddings, weighted by
-/// mask area.
-///
-/// Returns `None` without embeddings, or if the object is at least as near to a negative.
-pub fn margin(object: &Object, query: &TextQuery) -> Option<f32> {
-    (is_seen(object) && !is_negative(object, query))
-        .then(|| mean_over_views(object, |e| query.margin(e)))
 }
 
 /// Returns all objects, sorted by rank in descending order.
@@ -367,6 +251,7 @@ pub(crate) mod tests {
             embeddings: vec![e.to_vec()],
             areas: vec![0.1],
             views: 1,
+            detected: None,
         };
         Grid {
             objects: vec![
@@ -459,6 +344,7 @@ pub(crate) mod tests {
             embeddings: cosines.into_iter().map(|c| c.to_vec()).collect(),
             areas,
             views,
+            detected: None,
         }
     }
 

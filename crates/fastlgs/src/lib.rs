@@ -21,6 +21,7 @@ pub mod calibrate;
 pub mod calibrations;
 mod checkpoints;
 mod compared;
+pub mod detections;
 mod embedding_views;
 mod error;
 pub mod eval;

@@ -4,7 +4,7 @@ use crate::query::selection;
 use crate::query::sheet::{self, Tile};
 use crate::{Result, Run, Scene};
 use fastlgs_core::image_io;
-use fastlgs_grid::query;
+use fastlgs_grid::evidence;
 use fastlgs_grid::{Grid, Object};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -161,7 +161,7 @@ pub fn likeliest_names(scene: &Scene, grid: &Grid, most: usize) -> Result<Vec<Ve
     let scores: Vec<Vec<f32>> = vocabulary
         .par_iter()
         .map(|(_, query)| {
-            let evidence = query::evidence(grid, query);
+            let evidence = evidence::evidence(grid, query);
             evidence.iter().map(|evidence| evidence.score).collect()
         })
         .collect();

@@ -3,7 +3,7 @@
 use crate::cache::{self, Cache};
 use crate::{Result, Run, model_choice};
 use fastlgs_core::{Camera, Error, LabelMap, Level, SceneFolder};
-use fastlgs_grid::evidence;
+use fastlgs_grid::mask_pairs;
 use fastlgs_grid::mapping::Mask;
 use fastlgs_vision::{Encoder, histogram};
 use image::RgbImage;
@@ -56,8 +56,8 @@ pub fn training_descriptors(
     run: &Run,
 ) -> Result<Vec<Mask>> {
     let manifest = folder.manifest()?;
-    if evidence::masks_path(folder).is_file() {
-        let (masks, encoder) = evidence::load_masks(folder)?;
+    if mask_pairs::masks_path(folder).is_file() {
+        let (masks, encoder) = mask_pairs::load_masks(folder)?;
         // Stored descriptors may come from another encoder.
         if model_choice::is_current(
             &manifest,
@@ -128,6 +128,6 @@ pub(crate) fn compute_descriptors(
         .map(of_view)
         .collect::<Result<Vec<_>>>()?
         .concat();
-    evidence::save_masks(folder, &found, identity.unwrap_or_default())?;
+    mask_pairs::save_masks(folder, &found, identity.unwrap_or_default())?;
     Ok(found)
 }

@@ -5,7 +5,7 @@ use crate::{Error, Result, calibrations};
 use fastlgs_core::scene_folder::{Manifest, ModelFile};
 use fastlgs_core::{Camera, LabelMap, Level, MaskList, SceneFolder};
 use fastlgs_grid::mapping::Mask;
-use fastlgs_grid::{Grid, evidence};
+use fastlgs_grid::{Grid, mask_pairs};
 use fastlgs_vision::crops::Background;
 use fastlgs_vision::import::{self, Import, Lens};
 use fastlgs_vision::pull::ModelPair;
@@ -558,7 +558,7 @@ impl ImportedEmbeddings {
         Ok(Self {
             folder: folder.clone(),
             views,
-            masks: evidence::load_masks(folder)?.0,
+            masks: mask_pairs::load_masks(folder)?.0,
         })
     }
 }

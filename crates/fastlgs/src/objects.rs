@@ -1,7 +1,7 @@
 //! Finds objects from masks for `train`, by global mapping, or loads the objects of an earlier run.
 
 use crate::error::{Context, bail};
-use crate::{Result, Run, embedding_views, masks, model_choice};
+use crate::{Result, Run, detections, embedding_views, masks, model_choice};
 use fastlgs_core::mask_list::{AtomTable, Atoms};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder, fs};
 use fastlgs_grid::mapping::Mask;
@@ -296,6 +296,12 @@ pub fn embed_objects(
         .zip(chosen.parents.iter().zip(&chosen.support))
     {
         (object.parent, object.support, object.views) = (*parent, support.iou, support.views.len());
+    }
+    if let Some(detector) = detections::detector_of(&folder.manifest()?)? {
+        let votes = detections::votes(folder, training, &lists, &detector, run)?;
+        for (object, votes) in grid.objects.iter_mut().zip(votes) {
+            object.detected = Some(votes);
+        }
     }
     (grid.overlaps, grid.id_areas, grid.encoder) = (
         chosen.overlaps,

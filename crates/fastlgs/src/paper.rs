@@ -5,7 +5,7 @@ use crate::{Result, Run, masks, model_choice, objects};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
 use fastlgs_grid::codebook::Codebook;
 use fastlgs_grid::mapping::{self, PaperConfig};
-use fastlgs_grid::{Grid, codes, evidence};
+use fastlgs_grid::{Grid, codes, mask_pairs};
 
 /// Finds objects by Algorithm 1 of the paper from the masks of preprocessing, and writes the object
 /// maps.
@@ -16,7 +16,7 @@ pub fn map(
     run: &Run,
 ) -> Result<Grid> {
     let masks = masks::training_descriptors(folder, training, run)?;
-    let pairs = evidence::load_pairs(folder, &masks)?;
+    let pairs = mask_pairs::load_pairs(folder, &masks)?;
     let manifest = folder.manifest()?;
     // Embeddings are compared without their appearance part; with it, the masks of fox give twice
     // as many objects.

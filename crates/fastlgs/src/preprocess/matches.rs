@@ -4,7 +4,7 @@ use super::photos::PreparedPhoto;
 use crate::cache::{self, Cache};
 use crate::{Error, Result, Run, masks};
 use fastlgs_core::{Camera, SceneFolder};
-use fastlgs_grid::evidence::Pairs;
+use fastlgs_grid::mask_pairs::Pairs;
 use fastlgs_sfm::keypoints::{self, Keypoints};
 use fastlgs_sfm::matching;
 use fastlgs_sfm::tracks::{self, PairMatches};

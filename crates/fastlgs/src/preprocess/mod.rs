@@ -18,7 +18,7 @@ pub use config::{Adjusted, Brightness, Poses, PreprocessConfig, PreprocessReport
 use fastlgs_core::dataset::Dataset;
 use fastlgs_core::scene_folder::{Manifest, ModelFile, find_view};
 use fastlgs_core::{Camera, SceneFolder, dataset, labels};
-use fastlgs_grid::evidence;
+use fastlgs_grid::mask_pairs;
 use fastlgs_sfm::keypoints::{self, Keypoints};
 use fastlgs_sfm::pose_check::PoseCheckReport;
 use fastlgs_sfm::tracks::PairMatches;
@@ -404,7 +404,7 @@ impl Stage<'_> {
         self.laps.end("depths");
         folder.save_points(&points)?;
         let pairs = matches::count_mask_pairs(folder, &cameras, &keypoints, &matches)?;
-        evidence::save_pairs(folder, &pairs)?;
+        mask_pairs::save_pairs(folder, &pairs)?;
         self.laps.end("points");
         Ok(TrainingData {
             cameras,

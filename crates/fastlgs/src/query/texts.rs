@@ -10,8 +10,9 @@ use fastlgs_core::SceneFolder;
 use fastlgs_core::fs::cache_dir;
 use fastlgs_core::scene_folder::{Manifest, load_tensors, save_tensors};
 use fastlgs_grid::Grid;
-use fastlgs_grid::relevancy::{CANONICAL, Rule, TextQuery};
-use fastlgs_vision::{TextEncoder, names};
+use fastlgs_grid::relevancy::{CANONICAL, Rule, Source, TextQuery};
+use fastlgs_vision::detector::CLASSES;
+use fastlgs_vision::{Nouns, TextEncoder, names};
 use std::path::Path;
 
 /// Checks that the embeddings of the objects can be compared with those of `what` (texts or
@@ -70,6 +71,8 @@ pub struct Texts {
     /// How text queries rank and accept objects.
     rule: Rule,
     names: Names,
+    /// Which names detector and classifier know; `None` for CLIP, or if it is not installed.
+    nouns: Option<Nouns>,
     identity: String,
 }
 
@@ -111,6 +114,8 @@ impl Texts {
         let grid = Grid::load(folder)
             .context("the object grid cannot be read; run 'fastlgs train' again")?;
         check_embeddings(manifest, &grid, folder, "texts", length)?;
+        let has_nouns = manifest.encoder == calibrations::OFFLINE && Nouns::is_installed();
+        let nouns = has_nouns.then(Nouns::load).transpose()?;
         let (calibrations, identity) = (
             Calibrations::of(manifest),
             model_choice::identity_of(manifest),
@@ -121,6 +126,7 @@ impl Texts {
             calibrations,
             rule,
             names: Names::load()?,
+            nouns,
             identity,
         })
     }
@@ -282,7 +288,24 @@ impl Texts {
             canonical: self.canonical.clone(),
             min_canonical: anything,
             rule: self.rule,
+            source: self.source(text),
             ..TextQuery::new(vec![embedding], calibration)
+        }
+    }
+
+    /// Returns the source that knows a name.
+    fn source(&self, text: &str) -> Source {
+        let Some(nouns) = &self.nouns else {
+            return Source::Embeddings;
+        };
+        let classes = nouns.classes(text);
+        if classes.is_empty() {
+            Source::Unknown
+        } else if classes.detector.is_empty() {
+            Source::Embeddings
+        } else {
+            let name = |class: &usize| CLASSES[*class].to_owned();
+            Source::Detector(classes.detector.iter().map(name).collect())
         }
     }
 }

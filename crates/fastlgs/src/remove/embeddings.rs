@@ -4,7 +4,7 @@
 //! removed object would find what it stood on.
 
 use crate::query::selection;
-use crate::{Result, Run, Scene, embedding_views, model_choice, objects};
+use crate::{Result, Run, Scene, detections, embedding_views, model_choice, objects};
 use fastlgs_core::{Camera, SceneFolder};
 use fastlgs_grid::Grid;
 use fastlgs_grid::support::ViewSupport;
@@ -73,6 +73,12 @@ pub fn renew(
             new.map(|mask| (mask.embedding.clone(), mask.area)).unzip();
         if !embeddings.is_empty() {
             (object.embeddings, object.areas) = (embeddings, areas);
+        }
+    }
+    if let Some(detector) = detections::detector_of(scene.manifest())? {
+        let votes = detections::votes(folder, &cameras, &grid.lists(), &detector, run)?;
+        for ((object, votes), _) in grid.objects.iter_mut().zip(votes).zip(&touched).filter(|(_, touched)| **touched) {
+            object.detected = Some(votes);
         }
     }
     tracing::debug!(

@@ -6,7 +6,7 @@ use crate::staged::StagedOutput;
 use crate::{Result, Run, Scene, SceneNotes, transparent};
 use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
-use fastlgs_grid::evidence::{self, Pairs};
+use fastlgs_grid::mask_pairs::{self, Pairs};
 use fastlgs_vision::inpaint::Inpainter;
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use std::collections::BTreeSet;
@@ -53,7 +53,7 @@ pub fn write(
     refine::refine(session, folder, &hidden.in_training, run)?;
     embeddings::renew(session, grid, folder, &hidden.in_training, run)?;
     // The masks have other labels now, so the pairs of the original scene are invalid.
-    evidence::save_pairs(folder, &Pairs::new())?;
+    mask_pairs::save_pairs(folder, &Pairs::new())?;
     grid.save(folder)?;
     ply::write(&folder.ply_path(), session.gaussians())?;
     let compact = folder.compact_path();
