@@ -9,13 +9,14 @@ use fastlgs_vision::{Detector, Nouns};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Votes for an object by class: the mean over its views of score times IoU of the boxes, 0 to 1.
+/// Votes for an object by class, 0 to 1: the mean over its views of score times IoU of the boxes.
+/// Each view has the square root of the object's area as weight.
 pub type Votes = BTreeMap<String, f32>;
 
 /// Least IoU of the box of a detection with the box of an object that it votes for.
 const MIN_IOU: f32 = 0.5;
 /// Least number of pixels of an object in a view that counts.
-const MIN_PIXELS: u32 = 30;
+const MIN_PIXELS: usize = 30;
 /// Smallest vote that is stored.
 const MIN_VOTE: f32 = 0.005;
 
@@ -44,26 +45,29 @@ pub fn votes(
 ) -> Result<Vec<Votes>> {
     let objects = lists.iter().flatten().copied().max().unwrap_or(0);
     let work = run.work("detections", training.len() as u64);
-    let of_view = |camera: &Camera| -> Result<Vec<Option<Vec<f32>>>> {
-        let boxes = object_boxes(&folder.objects(&camera.name)?, lists, objects);
+    let of_view = |camera: &Camera| -> Result<Vec<Option<ViewVotes>>> {
+        let seen = objects_in(&folder.objects(&camera.name)?, lists, objects);
         let found = detector.detect(&folder.photo(&camera.name)?)?;
         work.advance()?;
-        let votes = boxes
-            .into_iter()
-            .map(|bounds| Some(votes_for(bounds?, &found)));
-        Ok(votes.collect())
+        let votes = |shown: ShownObject| ViewVotes {
+            weight: shown.area.sqrt(),
+            by_class: votes_for(shown.bounds, &found),
+        };
+        Ok(seen.into_iter().map(|shown| shown.map(votes)).collect())
     };
     let by_view = training
         .par_iter()
         .map(of_view)
         .collect::<Result<Vec<_>>>()?;
     let mean_of = |object: usize| {
-        let seen: Vec<&Vec<f32>> = by_view
+        let seen: Vec<&ViewVotes> = by_view
             .iter()
             .filter_map(|view| view[object].as_ref())
             .collect();
+        let total: f32 = seen.iter().map(|votes| votes.weight).sum();
         let mean = |class: usize| {
-            seen.iter().map(|votes| votes[class]).sum::<f32>() / seen.len().max(1) as f32
+            let weighted = seen.iter().map(|votes| votes.weight * votes.by_class[class]);
+            weighted.sum::<f32>() / total.max(f32::MIN_POSITIVE)
         };
         let all = CLASSES.iter().enumerate();
         all.map(|(class, name)| ((*name).to_owned(), mean(class)))
@@ -71,6 +75,21 @@ pub fn votes(
             .collect()
     };
     Ok((0..usize::from(objects)).map(mean_of).collect())
+}
+
+/// Votes of one view for an object.
+struct ViewVotes {
+    weight: f32,
+    /// The largest vote for each class.
+    by_class: Vec<f32>,
+}
+
+/// An object in a view.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct ShownObject {
+    bounds: Bounds,
+    /// Share of the view's area.
+    area: f32,
 }
 
 /// Returns the largest vote of a view for each class.
@@ -85,31 +104,35 @@ fn votes_for(bounds: Bounds, found: &[Detection]) -> Vec<f32> {
     votes
 }
 
-/// Returns the box of each object in a view; `None` for one with too few pixels.
-fn object_boxes(map: &LabelMap, lists: &[Vec<u16>], objects: u16) -> Vec<Option<Bounds>> {
+/// Returns each object of a view; `None` for one with too few pixels.
+fn objects_in(map: &LabelMap, lists: &[Vec<u16>], objects: u16) -> Vec<Option<ShownObject>> {
     let areas = map.areas();
-    let mut boxes: Vec<Option<([u32; 4], u32)>> = vec![None; usize::from(objects)];
+    let mut found: Vec<Option<([u32; 4], usize)>> = vec![None; usize::from(objects)];
     for (id, bounds) in map.boxes().into_iter().enumerate() {
         let (Some(own), Some(list)) = (bounds, lists.get(id)) else {
             continue;
         };
         for object in list {
-            let (all, pixels) = boxes[usize::from(*object) - 1].get_or_insert((own, 0));
+            let (all, pixels) = found[usize::from(*object) - 1].get_or_insert((own, 0));
+            let [left, top, right, bottom] = *all;
             *all = [
-                all[0].min(own[0]),
-                all[1].min(own[1]),
-                all[2].max(own[2]),
-                all[3].max(own[3]),
+                left.min(own[0]),
+                top.min(own[1]),
+                right.max(own[2]),
+                bottom.max(own[3]),
             ];
-            *pixels += areas[id] as u32;
+            *pixels += areas[id];
         }
     }
     let size = [map.width, map.height].map(|n| n as f32);
-    let share = |bounds: [u32; 4]| std::array::from_fn(|k| bounds[k] as f32 / size[k % 2]);
-    boxes
+    let shown = |(bounds, pixels): ([u32; 4], usize)| ShownObject {
+        bounds: std::array::from_fn(|k| bounds[k] as f32 / size[k % 2]),
+        area: pixels as f32 / (size[0] * size[1]),
+    };
+    let is_seen = |found: &([u32; 4], usize)| found.1 >= MIN_PIXELS;
+    found
         .into_iter()
-        .map(|found| found.filter(|(_, pixels)| *pixels >= MIN_PIXELS))
-        .map(|found| found.map(|(bounds, _)| share(bounds)))
+        .map(|found| found.filter(is_seen).map(shown))
         .collect()
 }
 
@@ -132,13 +155,13 @@ mod tests {
             labels: labels.collect(),
         };
         let lists = [vec![], vec![1, 3], vec![2, 3], vec![3], vec![4]];
-        let boxes = object_boxes(&map, &lists, 4);
+        let shown = |bounds: Bounds, area: f32| Some(ShownObject { bounds, area });
         assert_eq!(
-            boxes,
+            objects_in(&map, &lists, 4),
             [
-                Some([0.0, 0.0, 0.25, 0.5]),
-                Some([0.25, 0.0, 0.5, 0.5]),
-                Some([0.0, 0.0, 0.5, 0.5]),
+                shown([0.0, 0.0, 0.25, 0.5], 0.125),
+                shown([0.25, 0.0, 0.5, 0.5], 0.125),
+                shown([0.0, 0.0, 0.5, 0.5], 0.25),
                 None
             ]
         );
