@@ -45,7 +45,7 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
         Source::Detector(classes) if grid.has_detections() => of_objects(grid, |object, _| {
             by_votes(object, query, classes)
         }),
-        Source::Unknown if grid.has_detections() => {
+        Source::Unknown if !query.is_known(grid) => {
             let unknown = |object: &Object, prior: f32| Evidence {
                 score: 0.0,
                 ..by_cosines(grid, object, prior, query)

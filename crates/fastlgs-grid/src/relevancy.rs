@@ -1,6 +1,7 @@
 //! Compares embeddings with a query: LERF's relevancy (paper, eq. 4).
 
 use crate::calibration::Calibration;
+use crate::grid::Grid;
 use serde::{Deserialize, Serialize};
 
 /// Canonical phrases: those of LERF, without "things".
@@ -89,6 +90,11 @@ impl TextQuery {
             from_example: true,
             ..Self::new(positive, calibration)
         }
+    }
+
+    /// Returns whether a source of evidence knows the name in this scene.
+    pub fn is_known(&self, grid: &Grid) -> bool {
+        self.source != Source::Unknown || !grid.has_detections()
     }
 
     /// Returns the relevancy S = min_i exp(t phi.q) / (exp(t phi.c_i) + exp(t phi.q)), 0 to 1. At

@@ -139,7 +139,10 @@ function show(text, { answer, best }) {
   } else {
     const near = answer.candidates.slice(0, NEAREST).map(({ id }) => objects.title(id)).join(", ");
     const accept = scene.shared ? "" : `; if one of them is meant, select it and name it "${text}"`;
-    say(`"${text}" is not found in this scene: the best object scores ${answer.score.toFixed(2)}, at least ${scene.min_score.toFixed(2)} is needed. Nearest: ${near}${accept} (${ms} ms)`, true);
+    const refusal = answer.known === false
+      ? `The built-in encoder does not know "${text}": click on the object`
+      : `"${text}" is not found in this scene: the best object scores ${answer.score.toFixed(2)}, at least ${scene.min_score.toFixed(2)} is needed. Nearest: ${near}`;
+    say(`${refusal}${accept} (${ms} ms)`, true);
     // The name is offered for the object that is selected next.
     $("its-name").value = text;
   }

@@ -11,6 +11,7 @@ Writes  detector.onnx   NanoDet-g: BGR minus mean over deviation [1,3,416,416]
 
 import json
 import os
+import re
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -138,6 +139,10 @@ PHYSICAL, ANIMAL = "00001930", "00015568"
 ANIMALS = 398
 # A noun that covers a larger share of all classes names none of them.
 BROADEST = 0.2
+# Share of the kinds of a noun that the classifier must know to know the noun: its four foxes stand for foxes, but its
+# sliding door does not stand for doors. Every object looks like some class, so that such answers are mostly wrong. The
+# detector finds nothing where it knows nothing.
+FEWEST_KINDS = {"detector": 0.0, "classifier": 0.5}
 # Number of senses of a noun that are considered, besides those of COCO. Later ones are often slang.
 FREQUENT = 3
 # Index of COCO's class of persons.
@@ -148,7 +153,7 @@ class WordNet:
     """The concrete nouns of WordNet: senses of each word, and the words and the kinds above each sense."""
 
     def __init__(self, folder):
-        self.words, self.above = {}, {}
+        self.words, self.above, self.below = {}, {}, defaultdict(set)
         for line in self.lines(folder / "data.noun"):
             fields = line.split("|")[0].split()
             count = int(fields[3], 16)
@@ -156,6 +161,8 @@ class WordNet:
             self.words[fields[0]] = {word.lower().replace("_", " ") for word in fields[4 : 4 + 2 * count : 2]}
             # Names of persons and places are instances ("@i"), not kinds.
             self.above[fields[0]] = [target for kind, target in zip(pointers[0::4], pointers[1::4]) if kind == "@"]
+            for kind in self.above[fields[0]]:
+                self.below[kind].add(fields[0])
         self.senses = {}
         for line in self.lines(folder / "index.noun"):
             fields = line.split()
@@ -228,8 +235,11 @@ def convert_nouns(folder, out):
         concrete = [s for s in wordnet.senses[word] if s in is_class or PHYSICAL in wordnet.kinds(s)]
         found = set()
         for sense in concrete[:FREQUENT] + [s for s in concrete if s in given[word]]:
-            kinds = below[source].get(sense, set())
-            found |= kinds if len(kinds) <= BROADEST * len(sources[source]) else set()
+            classes = below[source].get(sense, set())
+            kinds = wordnet.below[sense]
+            known = sum(kind in below[source] for kind in kinds)
+            is_known = sense in is_class or known >= FEWEST_KINDS[source] * len(kinds)
+            found |= classes if is_known and len(classes) <= BROADEST * len(sources[source]) else set()
         # A rare sense is not looked for under more general names: "fox" is also a kind of person.
         for kind in wordnet.kinds(concrete[0])[1:] if concrete else []:
             found |= at[source].get(kind, set())
@@ -245,6 +255,12 @@ def convert_nouns(folder, out):
         # A compound without classes stays, so that its last word is not looked up instead.
         if entry or " " in word:
             nouns[word] = entry
+    # The classifier's own names: "cardboard box / carton", "custard apple (cherimoya)".
+    for index, own in enumerate(names):
+        for name in re.split(r" / |,|\(|\)", ",".join(own).lower()):
+            if name.strip() and name.strip() not in wordnet.senses:
+                entry = nouns.setdefault(name.strip(), {})
+                entry["classifier"] = sorted({index, *entry.get("classifier", [])})
     partial = out / "nouns.partial"
     partial.write_text(json.dumps(nouns, separators=(",", ":")))
     os.replace(partial, out / "nouns.json")

@@ -111,8 +111,15 @@ fn nearest_text(report: &AnswerReport, scene: &Path) -> Vec<String> {
         let view = view.map_or(String::new(), |view| format!(", best view {view}"));
         format!("#{} (confidence {:.2}{view})", object.id, object.score)
     };
-    let near: Vec<String> = nearest.iter().map(near).collect();
     let (scene, id) = (scene.display(), first.id);
+    if !report.known {
+        return vec![
+            format!("  to point at it: fastlgs query {scene} --point X,Y"),
+            format!("  to teach it:    fastlgs teach \"{text}\" {scene} --point X,Y"),
+            "  to know more names, make the scene with --encoder clip".to_owned(),
+        ];
+    }
+    let near: Vec<String> = nearest.iter().map(near).collect();
     let mut lines = vec![
         format!("  nearest objects: {}", near.join(", ")),
         format!("  to see one:    fastlgs query {scene} --object {id} -o DIR"),
@@ -152,9 +159,13 @@ fn answer_text(report: &AnswerReport, scene: &Path) -> String {
     };
     let taught = if report.taught { ", taught" } else { "" };
     if !report.found {
-        let verdict = format!(
-            "{text}: not found; the best object has confidence {score:.2}{calibration_note}{taught}"
-        );
+        let verdict = if report.known {
+            format!(
+                "{text}: not found; the best object has confidence {score:.2}{calibration_note}{taught}"
+            )
+        } else {
+            format!("{text}: the built-in encoder does not know this name")
+        };
         let mut lines = vec![verdict];
         lines.extend(nearest_text(report, scene));
         return lines.join("\n");

@@ -1,6 +1,6 @@
 //! The answer to a query in one view, with its report and images.
 
-use super::object_query::ObjectQuery;
+use super::object_query::{EmbeddedQuery, ObjectQuery};
 use super::pictures::{heatmap, mask_picture, overlay};
 use super::selection;
 use crate::{Result, Scene};
@@ -40,6 +40,8 @@ pub struct AnswerReport {
     pub calibrated: bool,
     /// Whether the text is a taught name.
     pub taught: bool,
+    /// Whether encoder or detector know the name. An unknown name is never found.
+    pub known: bool,
     /// Targets: the objects of the answer.
     pub objects: Vec<ObjectReport>,
     /// Objects of the highest ranks, targets or not.
@@ -209,7 +211,7 @@ impl Answer {
         &self,
         scene: &Scene,
         query: &ObjectQuery,
-        calibrated: bool,
+        embedded: &EmbeddedQuery,
         candidates: usize,
         mut ms: Milliseconds,
     ) -> AnswerReport {
@@ -226,7 +228,8 @@ impl Answer {
             size: format!("{}x{}", self.camera.width, self.camera.height),
             found: !targets.is_empty(),
             score: best_score(ranked),
-            calibrated,
+            calibrated: embedded.is_calibrated(),
+            known: embedded.is_known(&self.grid),
             taught: matches!(query, ObjectQuery::Text(_)) && scene.is_taught(&text),
             text,
             objects: targets

@@ -180,7 +180,7 @@ impl<'a> Query<'a> {
         answer.report = answer.describe(
             scene,
             &self.object,
-            embedded.is_calibrated(),
+            &embedded,
             self.candidates,
             ms,
         );

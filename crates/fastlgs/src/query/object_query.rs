@@ -206,6 +206,16 @@ impl EmbeddedQuery {
         }
     }
 
+    /// Returns whether a source of names knows the text, or both parts of "A of B". Pictures, pixels
+    /// and ids need none.
+    pub fn is_known(&self, grid: &Grid) -> bool {
+        let Self::Embedded(meant) = self else {
+            return true;
+        };
+        let known = |query: &TextQuery| query.is_known(grid);
+        known(&meant.phrase_query) || meant.split.as_ref().is_some_and(|split| split.iter().all(known))
+    }
+
     /// Ranks objects and selects the targets. For pixels, the ranking lists the objects there,
     /// smallest first, with their support as score. For an id, the object has its support, too.
     ///
