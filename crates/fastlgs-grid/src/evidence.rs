@@ -107,7 +107,7 @@ fn by_cosines(grid: &Grid, object: &Object, prior: f32, query: &TextQuery) -> Ev
 const ABSENT_VOTE: f32 = 0.042;
 /// Standard error of the vote for an object, as a share of the vote. Instances of a class in one
 /// scene differ by that much.
-const VOTE_ERROR: f32 = 0.35;
+const VOTE_ERROR: f32 = 0.3;
 
 /// Returns the evidence by the votes of the detector for these classes.
 fn by_votes(object: &Object, query: &TextQuery, classes: &[String]) -> Evidence {

@@ -5,6 +5,8 @@ use crate::query::sheet::{self, Tile};
 use crate::{Result, Run, Scene};
 use fastlgs_core::image_io;
 use fastlgs_grid::evidence;
+use fastlgs_grid::query::QueryConfig;
+use fastlgs_grid::relevancy::{Rule, Source, TextQuery};
 use fastlgs_grid::{Grid, Object};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -158,6 +160,7 @@ pub fn likeliest_names(scene: &Scene, grid: &Grid, most: usize) -> Result<Vec<Ve
         return Ok(vec![Vec::new(); grid.objects.len()]);
     }
     let vocabulary = scene.texts()?.vocabulary()?;
+    let min_score = QueryConfig::default().min_score(Rule::Calibrated);
     let scores: Vec<Vec<f32>> = vocabulary
         .par_iter()
         .map(|(_, query)| {
@@ -167,16 +170,24 @@ pub fn likeliest_names(scene: &Scene, grid: &Grid, most: usize) -> Result<Vec<Ve
         .collect();
     let of_object = |(place, object): (usize, &Object)| {
         let named = vocabulary.iter().zip(&scores);
-        let mut names: Vec<NameScore> = named
+        // Every object looks like some class of the encoder, but the detector finds only what it
+        // knows, so its names are listed first.
+        let is_detected = |query: &TextQuery, score: f32| {
+            matches!(query.source, Source::Detector(_)) && score >= min_score
+        };
+        let mut names: Vec<(bool, NameScore)> = named
             .filter(|_| !object.embeddings.is_empty())
-            .map(|((name, _), scores)| NameScore {
-                name: name.clone(),
-                score: scores[place],
+            .map(|((name, query), scores)| {
+                let score = scores[place];
+                let name = name.clone();
+                (is_detected(query, score), NameScore { name, score })
             })
             .collect();
-        names.sort_by(|a, b| b.score.total_cmp(&a.score));
-        names.truncate(most);
-        names
+        names.sort_by(|(a_detected, a), (b_detected, b)| {
+            let by_score = b.score.total_cmp(&a.score);
+            b_detected.cmp(a_detected).then(by_score)
+        });
+        names.into_iter().map(|row| row.1).take(most).collect()
     };
     Ok(grid.objects.iter().enumerate().map(of_object).collect())
 }

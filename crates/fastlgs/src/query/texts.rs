@@ -223,7 +223,22 @@ impl Texts {
             let query = self.embedded_query(&name, embedding);
             (name, query)
         });
-        Ok(taught.chain(known).collect())
+        // The detector's own names replace those of the classifier that mean the same.
+        let known = known.filter(|(_, query)| query.source == Source::Embeddings);
+        Ok(taught.chain(self.detector_names()).chain(known).collect())
+    }
+
+    /// Returns the names of the detector's classes with their queries; none if it is not used.
+    fn detector_names(&self) -> Vec<(String, TextQuery)> {
+        let named = |name: &&str| {
+            let query = TextQuery {
+                source: Source::Detector(vec![(*name).to_owned()]),
+                ..TextQuery::new(Vec::new(), self.calibrations.texts)
+            };
+            ((*name).to_owned(), query)
+        };
+        let classes = self.nouns.iter().flat_map(|_| &CLASSES);
+        classes.map(named).collect()
     }
 
     /// Returns the embeddings of everyday names. They are saved in the cache folder, because CLIP
