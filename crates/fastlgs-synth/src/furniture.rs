@@ -32,11 +32,12 @@ pub struct Placed {
 }
 
 /// Returns a round table with small objects on it and furniture around it.
-pub fn study() -> [Placed; 12] {
-    let [red, orange_peel, oak] = [
+pub fn study() -> [Placed; 11] {
+    let [red, orange_peel, oak, teal] = [
         Vec3::new(0.75, 0.1, 0.1),
         Vec3::new(0.95, 0.5, 0.08),
         Vec3::new(0.42, 0.27, 0.15),
+        Vec3::new(0.1, 0.42, 0.45),
     ];
     let top = 0.738;
     let placed = |name, make: BuildFn, color, at, yaw| Placed {
@@ -52,7 +53,6 @@ pub fn study() -> [Placed; 12] {
         placed("orange", orange, orange_peel, [0.36, top, 0.12], 0.4),
         placed("coffee mug", coffee_mug, red, [-0.1, top, 0.38], 0.6),
         placed("candle", candle, Vec3::ONE, [-0.32, top, -0.2], 0.0),
-        placed("bookcase", bookcase, Vec3::ONE, [0.0, 0.0, -1.5], 0.0),
         placed(
             "television",
             television,
@@ -60,22 +60,10 @@ pub fn study() -> [Placed; 12] {
             [1.45, 0.0, -0.45],
             -FRAC_PI_2 + 0.3,
         ),
-        placed(
-            "washing machine",
-            washing_machine,
-            Vec3::ONE,
-            [-1.4, 0.0, -0.45],
-            FRAC_PI_2 - 0.3,
-        ),
         placed("umbrella", umbrella, red, [-1.05, 0.0, 1.05], 0.0),
-        placed("dumbbell", dumbbell, Vec3::ONE, [-0.4, 0.0, 1.45], 0.5),
-        placed(
-            "soccer ball",
-            soccer_ball,
-            Vec3::ONE,
-            [0.25, 0.0, 1.35],
-            0.3,
-        ),
+        placed("chair", chair, oak, [0.1, 0.0, 1.05], PI),
+        placed("couch", couch, teal, [-1.45, 0.0, -0.5], FRAC_PI_2 - 0.3),
+        placed("potted plant", potted_plant, Vec3::ONE, [0.0, 0.0, -1.45], 0.0),
         placed(
             "traffic light",
             traffic_light,
@@ -84,6 +72,89 @@ pub fn study() -> [Placed; 12] {
             0.8,
         ),
     ]
+}
+
+/// A wooden chair with four legs and a back of three slats.
+fn chair() -> Vec<Piece> {
+    let mut pieces = vec![
+        piece(Block, [0.0, 0.45, 0.0], [0.21, 0.02, 0.21], WOOD),
+        piece(Block, [0.0, 0.98, -0.2], [0.21, 0.04, 0.015], WOOD),
+        piece(Block, [0.0, 0.82, -0.2], [0.2, 0.03, 0.012], WOOD),
+        piece(Block, [0.0, 0.66, -0.2], [0.2, 0.03, 0.012], WOOD),
+    ];
+    for side in [-1.0, 1.0] {
+        pieces.push(piece(
+            Block,
+            [side * 0.19, 0.215, 0.19],
+            [0.02, 0.215, 0.02],
+            DARKER,
+        ));
+        pieces.push(piece(
+            Block,
+            [side * 0.19, 0.51, -0.2],
+            [0.02, 0.51, 0.02],
+            DARKER,
+        ));
+    }
+    pieces
+}
+
+/// A couch with two seats, a back and two arms.
+fn couch() -> Vec<Piece> {
+    let mut pieces = vec![
+        piece(Block, [0.0, 0.2, 0.0], [0.75, 0.12, 0.36], OWN),
+        piece(Block, [0.0, 0.58, -0.3], [0.75, 0.28, 0.1], OWN),
+    ];
+    for side in [-1.0, 1.0] {
+        pieces.push(piece(
+            Block,
+            [side * 0.36, 0.38, 0.05],
+            [0.34, 0.075, 0.3],
+            OWN,
+        ));
+        pieces.push(piece(
+            Block,
+            [side * 0.82, 0.36, 0.0],
+            [0.1, 0.28, 0.38],
+            OWN,
+        ));
+        for end in [-1.0, 1.0] {
+            pieces.push(piece(
+                Block,
+                [side * 0.8, 0.04, end * 0.3],
+                [0.03, 0.04, 0.03],
+                BLACK,
+            ));
+        }
+    }
+    pieces
+}
+
+/// A plant with long leaves in a clay pot.
+fn potted_plant() -> Vec<Piece> {
+    let clay = Look::Painted(Vec3::new(0.68, 0.33, 0.2));
+    let soil = Look::Painted(Vec3::new(0.16, 0.1, 0.07));
+    let mut pieces = vec![
+        piece(Cylinder, [0.0, 0.14, 0.0], [0.15, 0.14, 0.15], clay),
+        piece(Cylinder, [0.0, 0.27, 0.0], [0.18, 0.03, 0.18], clay),
+        piece(Cylinder, [0.0, 0.3, 0.0], [0.16, 0.004, 0.16], soil),
+    ];
+    for k in 0..22 {
+        // The golden angle distributes the leaves evenly.
+        let angle = 2.4 * k as f32;
+        let rise = 0.2 + 0.6 * ((k * 7 % 22) as f32 / 21.0);
+        let reach = 0.34 - 0.22 * rise;
+        let green = Look::Painted(Vec3::new(0.1 + 0.06 * rise, 0.3 + 0.22 * rise, 0.1));
+        let at = [
+            reach * angle.cos(),
+            0.34 + 0.55 * rise,
+            reach * angle.sin(),
+        ];
+        let tilt = [-0.9 * angle.cos(), 0.9 * angle.sin()];
+        pieces.push(piece(Ball, at, [0.055, 0.17, 0.055], green).tilted(tilt[0], tilt[1]));
+    }
+    pieces.push(piece(Cylinder, [0.0, 0.5, 0.0], [0.02, 0.22, 0.02], DARKER));
+    pieces
 }
 
 /// Half extents of the bare room in metres.
@@ -272,21 +343,6 @@ fn traffic_light() -> Vec<Piece> {
 /// A ball with black pentagons and white hexagons.
 fn soccer_ball() -> Vec<Piece> {
     vec![piece(Ball, [0.0, 0.2, 0.0], [0.2; 3], Look::Football)]
-}
-
-/// A bar between two weights.
-fn dumbbell() -> Vec<Piece> {
-    let disc = |x: f32, radius: f32| {
-        piece(Cylinder, [x, 0.13, 0.0], [radius, 0.035, radius], BLACK).tilted(FRAC_PI_2, 0.0)
-    };
-    let bar = piece(Cylinder, [0.0, 0.13, 0.0], [0.022, 0.3, 0.022], STEEL).tilted(FRAC_PI_2, 0.0);
-    vec![
-        bar,
-        disc(-0.17, 0.13),
-        disc(-0.245, 0.105),
-        disc(0.17, 0.13),
-        disc(0.245, 0.105),
-    ]
 }
 
 /// A lamp with a foot, a pole and a shade.

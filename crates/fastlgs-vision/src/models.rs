@@ -227,7 +227,8 @@ fn install_names(venv: &Path, report: &mut impl FnMut(&str)) -> Result<()> {
     let path = std::env::join_paths(folders).unwrap_or(path);
     run(
         Command::new(npm)
-            .args(["install", "--silent", "--no-save", "--ignore-scripts"])
+            .args(["install", "--no-save", "--ignore-scripts", "--no-audit"])
+            .args(["--no-fund", "--loglevel", "error"])
             .arg("--prefix")
             .arg(venv)
             .args(packages)

@@ -217,19 +217,21 @@ impl Hierarchy {
         out
     }
 
-    /// Returns the nodes of at least `least` pixels, in descending order of area.
-    /// Of nested nodes whose area ratio is above `max_overlap`, only the one with the longest span
-    /// of dissimilarity is kept: the difference between the heights of its parent and its own.
-    pub fn stable_nodes(&self, least: f32, max_overlap: f32) -> Vec<usize> {
+    /// Returns the span of dissimilarity over which a node exists: the difference between the
+    /// heights of its parent and its own.
+    pub fn span(&self, node: usize) -> f32 {
+        let parent = self.nodes[node].parent;
+        parent.map_or(0.0, |p| self.nodes[p].height - self.nodes[node].height)
+    }
+
+    /// Returns the nodes that `is_candidate` accepts, in descending order of area. Of nested nodes
+    /// whose area ratio is above `max_overlap`, only the one with the longest span is kept.
+    pub fn stable_nodes(&self, is_candidate: impl Fn(usize) -> bool, max_overlap: f32) -> Vec<usize> {
         let area = |i: usize| self.nodes[i].area;
-        let span = |i: usize| {
-            self.nodes[i]
-                .parent
-                .map_or(0.0, |p| self.nodes[p].height - self.nodes[i].height)
-        };
+        let span = |i: usize| self.span(i);
         let upwards = |i: usize| std::iter::successors(Some(i), |i| self.nodes[*i].parent);
         let mut order: Vec<usize> = (0..self.nodes.len())
-            .filter(|i| area(*i) >= least)
+            .filter(|i| is_candidate(*i))
             .collect();
         order.sort_by(|a, b| span(*b).total_cmp(&span(*a)).then(a.cmp(b)));
         let mut kept = vec![false; self.nodes.len()];
@@ -335,14 +337,18 @@ mod tests {
             (below.iter().filter(|b| **b).count(), below[3], below[4]),
             (2, false, false)
         );
-        assert_eq!(tree.stable_nodes(1.0, 0.85).len(), 5);
+        let larger = |least: f32| {
+            let tree = &tree;
+            move |i: usize| tree.nodes[i].area >= least
+        };
+        assert_eq!(tree.stable_nodes(larger(1.0), 0.85).len(), 5);
         assert_eq!(
-            tree.stable_nodes(1.5 * 120.0, 0.85),
+            tree.stable_nodes(larger(1.5 * 120.0), 0.85),
             [4, 3],
             "nodes must be sorted by descending area"
         );
         assert_eq!(
-            tree.stable_nodes(1.5 * 120.0, 0.5),
+            tree.stable_nodes(larger(1.5 * 120.0), 0.5),
             [3],
             "the root spans no range of dissimilarity"
         );

@@ -10,7 +10,7 @@ use fastlgs_core::{LabelMap, Level, MaskList, image_io};
 use image::RgbImage;
 
 /// Version of [`OfflineSegmenter`]. Increase it whenever the same photo gets other masks.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// Finds masks in photos.
 pub trait Segmenter: Sync {
@@ -50,6 +50,10 @@ const WORK_SIDE: u32 = 480;
 const DENSE_SIDES: [u32; 2] = [480, 832];
 /// Smallest mask, as a share of the photo's area.
 const MIN_AREA: f32 = 0.003;
+/// Smallest mask of a region that differs much from its surroundings.
+const MIN_DISTINCT_AREA: f32 = 0.0003;
+/// Span of dissimilarity from which a region differs much from its surroundings.
+const DISTINCT_SPAN: f32 = 0.1;
 /// Number of features per pixel: L, a, b, then the dense embeddings.
 const FEATURES: usize = 3 + DENSE_SIDES.len() * DENSE;
 /// Of nested regions with an area ratio above this value, only one becomes a mask.
@@ -142,7 +146,12 @@ impl Segmenter for OfflineSegmenter {
         let [whole, part] = [WHOLE_HEIGHTS, PART_HEIGHTS]
             .map(|[low, high]| tree.is_below(&tree.best_cut(|i| persistence(&tree, i, low, high))));
         let mut list = MaskList::new(photo.width(), photo.height());
-        for node in tree.stable_nodes(MIN_AREA * (w * h) as f32, MAX_OVERLAP) {
+        let is_candidate = |node: usize| {
+            let share = tree.nodes[node].area / (w * h) as f32;
+            let is_distinct = tree.span(node) >= DISTINCT_SPAN;
+            share >= MIN_AREA || (share >= MIN_DISTINCT_AREA && is_distinct)
+        };
+        for node in tree.stable_nodes(is_candidate, MAX_OVERLAP) {
             let level = Level::ALL[usize::from(whole[node]) + usize::from(part[node])];
             list.add(
                 level,

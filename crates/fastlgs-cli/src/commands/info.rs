@@ -32,6 +32,7 @@ fn machine(common: &ui::Common) -> Result<Outcome> {
     );
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let (sift, installed) = (keypoints::backend(), models::offline_installed());
+    let knows_names = models::names_installed();
     // Without ONNX Runtime there are none.
     let providers = provider::built_in().unwrap_or_default();
     let providers: Vec<&str> = providers.into_iter().map(Provider::name).collect();
@@ -43,6 +44,7 @@ fn machine(common: &ui::Common) -> Result<Outcome> {
         "cores": cores,
         "sift": sift,
         "offline_models": installed,
+        "everyday_names": knows_names,
         "onnx_runtime": runtime,
         "onnx_providers": providers,
     });
@@ -70,8 +72,10 @@ fn machine(common: &ui::Common) -> Result<Outcome> {
             ),
             (
                 "encoders",
-                if installed {
+                if installed && knows_names {
                     "installed"
+                } else if installed {
+                    "installed, but the detector of everyday objects is missing, so fewer names are answered; run fastlgs models install-offline"
                 } else {
                     "missing; run fastlgs models install-offline"
                 }

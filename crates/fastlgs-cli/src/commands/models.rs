@@ -95,12 +95,15 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
 /// Lists the installed models, and those that can be installed.
 fn list(common: &ui::Common) -> Result<Outcome> {
     let mut files = Vec::new();
-    for file in models::OFFLINE_FILES {
+    for file in models::OFFLINE_FILES.iter().chain(&models::NAME_FILES) {
         let found = model_paths::digest(&model_paths::offline_dir().join(file)).ok();
         files.push(serde_json::json!({ "file": file, "bytes": found.as_ref().map(|f| f.0), "sha256": found.map(|f| f.1) }));
     }
     let packages = models::OFFLINE_PACKAGES
+        .iter()
+        .chain(&models::NAME_PACKAGES)
         .map(|(name, licence)| serde_json::json!({ "package": name, "licence": licence }));
+    let packages: Vec<serde_json::Value> = packages.collect();
     let named = MODEL_PAIRS.map(|model| {
         let files: Option<BTreeMap<String, ModelFile>> = fastlgs_core::fs::read_json(&model.folder().join("pulled.json")).ok();
         let calibrated = model.role == Role::Clip && model.pair().is_ok_and(|[image, _]| calibrations::has_calibration_file(&image));
@@ -109,6 +112,7 @@ fn list(common: &ui::Common) -> Result<Outcome> {
     let value = serde_json::json!({
         "folder": model_paths::offline_dir(),
         "installed": models::offline_installed(),
+        "everyday_names": models::names_installed(),
         "runtime": model_paths::runtime_library().ok(),
         "packages": packages,
         "files": files,

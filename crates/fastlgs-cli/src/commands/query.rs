@@ -76,6 +76,9 @@ pub struct Args {
     /// of a pixel's id weight.
     #[arg(long)]
     tau_ac: Option<f32>,
+    /// Add the same view of another scene to the contact sheet, for example after `fastlgs remove`.
+    #[arg(long, value_name = "SCENE")]
+    beside: Option<PathBuf>,
     /// Also write a heat map of the relevancy, in turbo colours.
     #[arg(long)]
     heatmap: bool,
@@ -262,15 +265,14 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
             runner.run_dialogue()
         }
         true => runner.answer_lines(),
-        false => runner.answer_arguments(common),
+        false => runner.answer_arguments(common, run),
     }
 }
 
 /// Refuses options that contradict each other.
 fn check(args: &Args, reads_lines: bool, exports: bool) -> Result<()> {
-    let by_example = !args.point.is_empty() || !args.image.is_empty() || !args.object.is_empty();
-    if by_example && !args.text.is_empty() {
-        bail!("query in one way: by text, by --point, by --image or by --object");
+    if args.beside.is_some() && args.output.is_none() {
+        bail!("--beside adds a picture to the contact sheet; give its folder with -o");
     }
     if reads_lines && args.text.len() > 1 {
         bail!("'-' reads all texts from standard input; leave out other texts");
@@ -315,7 +317,7 @@ fn search_library(root: &Path, args: &Args, common: &ui::Common, run: &Run) -> R
 }
 
 impl QueryRunner<'_> {
-    fn answer_arguments(&mut self, common: &ui::Common) -> Result<Outcome> {
+    fn answer_arguments(&mut self, common: &ui::Common, run: &Run) -> Result<Outcome> {
         let texts = self.args.text.iter().cloned().map(ObjectQuery::Text);
         let picture = |path: &PathBuf| -> Result<ObjectQuery> {
             let name = path
@@ -342,6 +344,9 @@ impl QueryRunner<'_> {
             for query in &queries {
                 answers.push(self.answer(query, place)?);
             }
+        }
+        if let Some(root) = &self.args.beside {
+            self.add_other_scene(root, run)?;
         }
         let sheet = self.sheet()?;
         let found = answers.iter().any(|a| a.found);
@@ -385,6 +390,19 @@ impl QueryRunner<'_> {
         };
         image_io::save_png(&path, sheet::sheet(&self.tiles, columns))?;
         Ok(Some(path))
+    }
+
+    /// Adds a tile of the last view in another scene.
+    fn add_other_scene(&mut self, root: &Path, run: &Run) -> Result<()> {
+        let Some(camera) = self.cameras.last() else {
+            return Ok(());
+        };
+        let frame = Scene::open(root, run.device)?.render(camera)?;
+        let picture = image_io::from_planar(frame.color(), frame.width, frame.height);
+        let name = root.file_name().unwrap_or_default().to_string_lossy();
+        self.tiles
+            .push(Tile::new(&picture, name.into_owned(), camera.name.clone()));
+        Ok(())
     }
 
     /// Answers each line of standard input with a line of JSON. Errors are answers, too.
