@@ -38,9 +38,9 @@ if [ "$name" = study ]; then
     # Taught names are stored in the scene folder instead of the user's own file.
     export FASTLGS_DATA=$scene
     echo "== teach";  $fastlgs teach "grandma's candle" "$scene" "$@" --point 183,118
-    echo "== remove"; $fastlgs remove "$scene" umbrella -o scenes/study-tidy
+    echo "== remove"; $fastlgs remove "$scene" chair -o scenes/study-tidy
     texts+=("grandma's candle")
-    # A click on the television, and the room without the umbrella.
+    # A click on the television, and the room without the chair.
     set -- "$@" --point 378,140 --beside scenes/study-tidy
 fi
 echo "== query: ${texts[*]}"

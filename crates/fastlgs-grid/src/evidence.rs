@@ -42,9 +42,9 @@ impl Evidence {
 pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     match &query.source {
         _ if query.rule == Rule::Paper => of_objects(grid, |object, _| by_relevancy(object, query)),
-        Source::Detector(classes) if grid.has_detections() => of_objects(grid, |object, _| {
-            by_votes(object, query, classes)
-        }),
+        Source::Detector(classes) if grid.has_detections() => {
+            of_objects(grid, |object, _| by_votes(object, query, classes))
+        }
         Source::Unknown if !query.is_known(grid) => {
             let unknown = |object: &Object, prior: f32| Evidence {
                 score: 0.0,

@@ -63,7 +63,13 @@ pub fn study() -> [Placed; 11] {
         placed("umbrella", umbrella, red, [-1.05, 0.0, 1.05], 0.0),
         placed("chair", chair, oak, [0.1, 0.0, 1.05], PI),
         placed("couch", couch, teal, [-1.45, 0.0, -0.5], FRAC_PI_2 - 0.3),
-        placed("potted plant", potted_plant, Vec3::ONE, [0.0, 0.0, -1.45], 0.0),
+        placed(
+            "potted plant",
+            potted_plant,
+            Vec3::ONE,
+            [0.0, 0.0, -1.45],
+            0.0,
+        ),
         placed(
             "traffic light",
             traffic_light,
@@ -145,11 +151,7 @@ fn potted_plant() -> Vec<Piece> {
         let rise = 0.2 + 0.6 * ((k * 7 % 22) as f32 / 21.0);
         let reach = 0.34 - 0.22 * rise;
         let green = Look::Painted(Vec3::new(0.1 + 0.06 * rise, 0.3 + 0.22 * rise, 0.1));
-        let at = [
-            reach * angle.cos(),
-            0.34 + 0.55 * rise,
-            reach * angle.sin(),
-        ];
+        let at = [reach * angle.cos(), 0.34 + 0.55 * rise, reach * angle.sin()];
         let tilt = [-0.9 * angle.cos(), 0.9 * angle.sin()];
         pieces.push(piece(Ball, at, [0.055, 0.17, 0.055], green).tilted(tilt[0], tilt[1]));
     }

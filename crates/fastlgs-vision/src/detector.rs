@@ -118,7 +118,8 @@ pub struct Detection {
 
 /// Returns the intersection of two rectangles over their union.
 pub fn box_iou(a: Bounds, b: Bounds) -> f32 {
-    let area = |[left, top, right, bottom]: Bounds| (right - left).max(0.0) * (bottom - top).max(0.0);
+    let area =
+        |[left, top, right, bottom]: Bounds| (right - left).max(0.0) * (bottom - top).max(0.0);
     let common = area([
         a[0].max(b[0]),
         a[1].max(b[1]),
@@ -183,8 +184,8 @@ impl Detector {
 /// Also returns the photo's rectangle in the input: left, top, width and height in pixels.
 fn letterboxed(photo: &RgbImage) -> (Vec<f32>, [f32; 4]) {
     let scale = SIDE as f32 / photo.width().max(photo.height()) as f32;
-    let [w, h] = [photo.width(), photo.height()]
-        .map(|n| ((n as f32 * scale).round() as u32).clamp(1, SIDE));
+    let [w, h] =
+        [photo.width(), photo.height()].map(|n| ((n as f32 * scale).round() as u32).clamp(1, SIDE));
     let small = image_io::resize(photo, w, h);
     let (left, top) = ((SIDE - w) / 2, (SIDE - h) / 2);
     let pixels = (SIDE * SIDE) as usize;
@@ -194,8 +195,7 @@ fn letterboxed(photo: &RgbImage) -> (Vec<f32>, [f32; 4]) {
     for (x, y, pixel) in small.enumerate_pixels() {
         let place = ((top + y) * SIDE + left + x) as usize;
         for k in 0..3 {
-            image[k * pixels + place] =
-                (f32::from(pixel[2 - k]) - MEAN_BGR[k]) / DEVIATION_BGR[k];
+            image[k * pixels + place] = (f32::from(pixel[2 - k]) - MEAN_BGR[k]) / DEVIATION_BGR[k];
         }
     }
     (image, [left, top, w, h].map(|v| v as f32))
@@ -219,6 +219,7 @@ fn without_duplicates(mut found: Vec<Detection>) -> Vec<Detection> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use fastlgs_synth::Kind;
 
     #[test]
     fn the_best_of_two_overlapping_boxes_is_kept() {
@@ -229,11 +230,56 @@ mod tests {
         };
         assert!((box_iou([0.0, 0.0, 2.0, 1.0], [1.0, 0.0, 3.0, 1.0]) - 1.0 / 3.0).abs() < 1e-6);
         assert_eq!(box_iou([0.0, 0.0, 1.0, 1.0], [2.0, 2.0, 3.0, 3.0]), 0.0);
-        let found = vec![detection(0.5, 0.1), detection(0.9, 0.0), detection(0.3, 0.6)];
+        let found = vec![
+            detection(0.5, 0.1),
+            detection(0.9, 0.0),
+            detection(0.3, 0.6),
+        ];
         assert_eq!(
             without_duplicates(found),
             [detection(0.9, 0.0), detection(0.3, 0.6)]
         );
+    }
+
+    #[test]
+    fn a_generated_chair_is_detected() {
+        let detector = match Detector::load() {
+            Ok(detector) => detector,
+            Err(e) => return crate::skip::skip(format_args!("{e}")),
+        };
+        let world = Kind::Study
+            .world("".as_ref(), 8, (400, 300), 0)
+            .expect("a room");
+        let chair = 1 + world
+            .objects
+            .iter()
+            .position(|object| object.name == "chair")
+            .expect("a chair") as u16;
+        let class = CLASSES.iter().position(|class| *class == "chair");
+        let mut best = Vec::new();
+        for view in 0..8 {
+            let view = world.render(view, 1);
+            let Some([left, top, right, bottom]) = view.instances.boxes()[usize::from(chair)]
+            else {
+                continue;
+            };
+            let share = |v: u32, size: u32| v as f32 / size as f32;
+            let (w, h) = (view.instances.width, view.instances.height);
+            let bounds = [
+                share(left, w),
+                share(top, h),
+                share(right, w),
+                share(bottom, h),
+            ];
+            let found = detector.detect(&view.photo).expect("detections");
+            let scores = found
+                .iter()
+                .filter(|d| Some(d.class) == class && box_iou(d.bounds, bounds) > 0.5)
+                .map(|d| d.score);
+            best.push(scores.fold(0.0, f32::max));
+        }
+        let mean = best.iter().sum::<f32>() / best.len() as f32;
+        assert!(mean > 0.3, "scores of the chair in each view: {best:?}");
     }
 
     #[test]

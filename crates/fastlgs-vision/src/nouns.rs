@@ -124,4 +124,36 @@ mod tests {
         assert!(nouns.classes("picture frame").is_empty());
         assert!(nouns.classes("of").is_empty() && nouns.classes("").is_empty());
     }
+
+    #[test]
+    fn wordnet_relates_names_to_classes() {
+        let nouns = match Nouns::load() {
+            Ok(nouns) => nouns,
+            Err(e) => return crate::skip::skip(format_args!("{e}")),
+        };
+        let detected = [
+            ("armchair", "chair"),
+            ("office chair", "chair"),
+            ("piano stool", "chair"),
+            ("bonsai tree", "potted plant"),
+            ("monitor", "tv"),
+            ("desk", "dining table"),
+            ("sofas", "couch"),
+            ("mobile phone", "cell phone"),
+        ];
+        for (name, class) in detected {
+            let classes = nouns.classes(name).detector;
+            let names: Vec<&str> = classes.iter().map(|index| CLASSES[*index]).collect();
+            assert_eq!(names, [class], "{name}");
+        }
+        // The classifier knows these, and the detector does not.
+        for name in ["carton of juice", "fox", "table lamp", "bookcase"] {
+            let classes = nouns.classes(name);
+            assert!(classes.detector.is_empty(), "{name}: {classes:?}");
+            assert!(!classes.classifier.is_empty(), "{name}");
+        }
+        for name in ["ceiling", "picture frame", "door", "zzyzx"] {
+            assert!(nouns.classes(name).is_empty(), "{name}");
+        }
+    }
 }

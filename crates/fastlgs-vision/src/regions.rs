@@ -226,13 +226,15 @@ impl Hierarchy {
 
     /// Returns the nodes that `is_candidate` accepts, in descending order of area. Of nested nodes
     /// whose area ratio is above `max_overlap`, only the one with the longest span is kept.
-    pub fn stable_nodes(&self, is_candidate: impl Fn(usize) -> bool, max_overlap: f32) -> Vec<usize> {
+    pub fn stable_nodes(
+        &self,
+        is_candidate: impl Fn(usize) -> bool,
+        max_overlap: f32,
+    ) -> Vec<usize> {
         let area = |i: usize| self.nodes[i].area;
         let span = |i: usize| self.span(i);
         let upwards = |i: usize| std::iter::successors(Some(i), |i| self.nodes[*i].parent);
-        let mut order: Vec<usize> = (0..self.nodes.len())
-            .filter(|i| is_candidate(*i))
-            .collect();
+        let mut order: Vec<usize> = (0..self.nodes.len()).filter(|i| is_candidate(*i)).collect();
         order.sort_by(|a, b| span(*b).total_cmp(&span(*a)).then(a.cmp(b)));
         let mut kept = vec![false; self.nodes.len()];
         // Area of the largest kept node inside each node.

@@ -26,8 +26,7 @@ const MIN_VOTE: f32 = 0.005;
 /// # Errors
 /// A file that is damaged.
 pub fn detector_of(manifest: &Manifest) -> Result<Option<Detector>> {
-    let is_used =
-        manifest.encoder == OFFLINE && Detector::is_installed() && Nouns::is_installed();
+    let is_used = manifest.encoder == OFFLINE && Detector::is_installed() && Nouns::is_installed();
     Ok(is_used.then(Detector::load).transpose()?)
 }
 
@@ -66,7 +65,9 @@ pub fn votes(
             .collect();
         let total: f32 = seen.iter().map(|votes| votes.weight).sum();
         let mean = |class: usize| {
-            let weighted = seen.iter().map(|votes| votes.weight * votes.by_class[class]);
+            let weighted = seen
+                .iter()
+                .map(|votes| votes.weight * votes.by_class[class]);
             weighted.sum::<f32>() / total.max(f32::MIN_POSITIVE)
         };
         let all = CLASSES.iter().enumerate();

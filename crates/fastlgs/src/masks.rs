@@ -3,8 +3,8 @@
 use crate::cache::{self, Cache};
 use crate::{Result, Run, model_choice};
 use fastlgs_core::{Camera, Error, LabelMap, Level, SceneFolder};
-use fastlgs_grid::mask_pairs;
 use fastlgs_grid::mapping::Mask;
+use fastlgs_grid::mask_pairs;
 use fastlgs_vision::{Encoder, histogram};
 use image::RgbImage;
 use rayon::prelude::*;

@@ -106,6 +106,14 @@ fn parse_share(text: &str) -> Result<f32, String> {
 /// Formats the nearest objects of a text that is not found, and how to accept one.
 fn nearest_text(report: &AnswerReport, scene: &Path) -> Vec<String> {
     let AnswerReport { text, nearest, .. } = report;
+    let scene = scene.display();
+    if !report.known {
+        return vec![
+            format!("  to point at it: fastlgs query {scene} --point X,Y"),
+            format!("  to teach it:    fastlgs teach \"{text}\" {scene} --point X,Y"),
+            "  to know more names, make the scene with --encoder clip".to_owned(),
+        ];
+    }
     let Some(first) = nearest.first() else {
         return Vec::new();
     };
@@ -114,14 +122,7 @@ fn nearest_text(report: &AnswerReport, scene: &Path) -> Vec<String> {
         let view = view.map_or(String::new(), |view| format!(", best view {view}"));
         format!("#{} (confidence {:.2}{view})", object.id, object.score)
     };
-    let (scene, id) = (scene.display(), first.id);
-    if !report.known {
-        return vec![
-            format!("  to point at it: fastlgs query {scene} --point X,Y"),
-            format!("  to teach it:    fastlgs teach \"{text}\" {scene} --point X,Y"),
-            "  to know more names, make the scene with --encoder clip".to_owned(),
-        ];
-    }
+    let id = first.id;
     let near: Vec<String> = nearest.iter().map(near).collect();
     let mut lines = vec![
         format!("  nearest objects: {}", near.join(", ")),

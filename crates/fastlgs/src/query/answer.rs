@@ -19,6 +19,8 @@ use std::time::Instant;
 pub const CANDIDATES: usize = 8;
 /// Largest number of objects that a report lists as nearest.
 const MAX_NEAREST: usize = 3;
+/// Least score of a nearest object.
+const MIN_NEAREST_SCORE: f32 = 0.01;
 /// Number of pixels below which an answer counts as hardly visible in a view.
 const MIN_VISIBLE_PIXELS: usize = 30;
 
@@ -65,7 +67,8 @@ pub struct AnswerReport {
 }
 
 impl AnswerReport {
-    /// Sets `nearest` to the objects of the highest ranks, at most three, if nothing was found.
+    /// Sets `nearest` to the objects of the highest ranks, at most three, if nothing was found. Objects
+    /// without any evidence are left out.
     ///
     /// # Errors
     /// The device fails.
@@ -73,7 +76,8 @@ impl AnswerReport {
         if self.found {
             return Ok(());
         }
-        for &Hit { id, score } in ranked.iter().take(MAX_NEAREST) {
+        let near = ranked.iter().filter(|hit| hit.score >= MIN_NEAREST_SCORE);
+        for &Hit { id, score } in near.take(MAX_NEAREST) {
             let best_view = scene.most_visible_view(grid, &[id])?;
             self.nearest.push(NearObject {
                 id,

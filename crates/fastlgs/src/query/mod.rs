@@ -177,13 +177,7 @@ impl<'a> Query<'a> {
             mask,
             report: AnswerReport::default(),
         };
-        answer.report = answer.describe(
-            scene,
-            &self.object,
-            &embedded,
-            self.candidates,
-            ms,
-        );
+        answer.report = answer.describe(scene, &self.object, &embedded, self.candidates, ms);
         answer.report.find_best_view(scene, &answer.grid)?;
         let ranked = &answer.found.ranked;
         answer.report.find_nearest(scene, &answer.grid, ranked)?;

@@ -213,7 +213,11 @@ impl EmbeddedQuery {
             return true;
         };
         let known = |query: &TextQuery| query.is_known(grid);
-        known(&meant.phrase_query) || meant.split.as_ref().is_some_and(|split| split.iter().all(known))
+        known(&meant.phrase_query)
+            || meant
+                .split
+                .as_ref()
+                .is_some_and(|split| split.iter().all(known))
     }
 
     /// Ranks objects and selects the targets. For pixels, the ranking lists the objects there,

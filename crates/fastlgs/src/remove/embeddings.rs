@@ -77,7 +77,13 @@ pub fn renew(
     }
     if let Some(detector) = detections::detector_of(scene.manifest())? {
         let votes = detections::votes(folder, &cameras, &grid.lists(), &detector, run)?;
-        for ((object, votes), _) in grid.objects.iter_mut().zip(votes).zip(&touched).filter(|(_, touched)| **touched) {
+        for ((object, votes), _) in grid
+            .objects
+            .iter_mut()
+            .zip(votes)
+            .zip(&touched)
+            .filter(|(_, touched)| **touched)
+        {
             object.detected = Some(votes);
         }
     }
