@@ -11,7 +11,7 @@ use fastlgs_core::{fs, metrics, npy};
 use fastlgs_grid::calibration::{Best, Calibration, Samples};
 use fastlgs_grid::query::{self, QueryConfig};
 use fastlgs_grid::relevancy::TextQuery;
-use fastlgs_grid::{Grid, Object};
+use fastlgs_grid::{Grid, Object, evidence};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -285,6 +285,7 @@ fn load_rooms(folder: &Path, length: usize) -> Result<Vec<Room>> {
                 embeddings: vec![row],
                 areas: vec![1.0],
                 views: *views as usize,
+                detected: None,
             });
         let grid = Grid {
             objects: objects.collect(),
