@@ -211,7 +211,8 @@ mod tests {
         };
         let cat = || Source::Detector(vec!["lion".to_owned(), "cat".to_owned()]);
         let by_detector = scores(&grid, cat());
-        assert!((by_detector[0] - (1.0 - (-0.5f32).exp())).abs() < 1e-6);
+        let expected = 1.0 - (-0.02f32 / ABSENT_VOTE).exp();
+        assert!((by_detector[0] - expected).abs() < 1e-6);
         assert!(by_detector[1] > 0.99);
         let by_embeddings = scores(&grid, Source::Embeddings);
         assert!(by_embeddings[0] > 0.9 && by_embeddings[1] < 0.1);

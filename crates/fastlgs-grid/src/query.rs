@@ -144,7 +144,7 @@ pub fn best_score(ranked: &[Hit]) -> f32 {
 
 /// Returns the targets; empty means "not found".
 ///
-/// The first target is the found object with the highest rank. Others are added if they do not
+/// The first target is the object with the highest rank, if it is found. Others are added if they do not
 /// overlap a target. Their rank and calibrated margin may be lower than the first one's by at most
 /// the combined standard error.
 ///
@@ -155,10 +155,11 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
     let of = |hit: &Hit| evidence[usize::from(hit.id) - 1];
     let found =
         |hit: &&Hit| of(hit).rank > f32::NEG_INFINITY && hit.score >= config.min_score(query.rule);
-    let mut found = ranked.iter().filter(found);
-    let Some(best) = found.next() else {
+    // If the likeliest object does not suffice, a less likely one is no answer either.
+    let Some(best) = ranked.first().filter(found) else {
         return Vec::new();
     };
+    let found = ranked.iter().skip(1).filter(found);
     let first = of(best);
     let mut chosen = vec![*best];
     let mut taken = grid.related(best.id);

@@ -139,10 +139,12 @@ PHYSICAL, ANIMAL = "00001930", "00015568"
 ANIMALS = 398
 # A noun that covers a larger share of all classes names none of them.
 BROADEST = 0.2
-# Share of the kinds of a noun that the classifier must know to know the noun: its four foxes stand for foxes, but its
-# sliding door does not stand for doors. Every object looks like some class, so that such answers are mostly wrong. The
-# detector finds nothing where it knows nothing.
-FEWEST_KINDS = {"detector": 0.0, "classifier": 0.5}
+# Share of the kinds of an artefact that the classifier must know to know its name: two pianos of three stand for
+# pianos, but a sliding door does not stand for doors. Kinds of animals, plants and food look alike, and the detector
+# finds nothing where it knows nothing.
+FEWEST_KINDS = 0.5
+# WordNet's file of artefacts.
+ARTEFACTS = "06"
 # Number of senses of a noun that are considered, besides those of COCO. Later ones are often slang.
 FREQUENT = 3
 # Index of COCO's class of persons.
@@ -150,14 +152,15 @@ PERSON = 0
 
 
 class WordNet:
-    """The concrete nouns of WordNet: senses of each word, and the words and the kinds above each sense."""
+    """The nouns of WordNet: senses of each word, and for each sense its words, its file and the kinds above and below."""
 
     def __init__(self, folder):
-        self.words, self.above, self.below = {}, {}, defaultdict(set)
+        self.words, self.above, self.below, self.files = {}, {}, defaultdict(set), {}
         for line in self.lines(folder / "data.noun"):
             fields = line.split("|")[0].split()
             count = int(fields[3], 16)
             pointers = fields[5 + 2 * count :]
+            self.files[fields[0]] = fields[1]
             self.words[fields[0]] = {word.lower().replace("_", " ") for word in fields[4 : 4 + 2 * count : 2]}
             # Names of persons and places are instances ("@i"), not kinds.
             self.above[fields[0]] = [target for kind, target in zip(pointers[0::4], pointers[1::4]) if kind == "@"]
@@ -238,7 +241,8 @@ def convert_nouns(folder, out):
             classes = below[source].get(sense, set())
             kinds = wordnet.below[sense]
             known = sum(kind in below[source] for kind in kinds)
-            is_known = sense in is_class or known >= FEWEST_KINDS[source] * len(kinds)
+            alike = source == "detector" or wordnet.files[sense] != ARTEFACTS
+            is_known = alike or sense in is_class or known >= FEWEST_KINDS * len(kinds)
             found |= classes if is_known and len(classes) <= BROADEST * len(sources[source]) else set()
         # A rare sense is not looked for under more general names: "fox" is also a kind of person.
         for kind in wordnet.kinds(concrete[0])[1:] if concrete else []:
@@ -249,7 +253,7 @@ def convert_nouns(folder, out):
     for word in wordnet.senses:
         found = {source: classes_of(word, source) for source in sources}
         # "mug" is a drinking vessel rather than a person.
-        if len(found["detector"]) + len(found["classifier"]) > 1:
+        if len(found["detector"]) + len(found["classifier"]) > 1 and word != "person":
             found["detector"] = [index for index in found["detector"] if index != PERSON]
         entry = {source: classes for source, classes in found.items() if classes}
         # A compound without classes stays, so that its last word is not looked up instead.
