@@ -6,7 +6,7 @@ use crate::{Result, Run, Scene};
 use fastlgs_core::image_io;
 use fastlgs_grid::evidence;
 use fastlgs_grid::query::QueryConfig;
-use fastlgs_grid::relevancy::{Rule, Source, TextQuery};
+use fastlgs_grid::relevancy::{Rule, Source};
 use fastlgs_grid::{Grid, Object};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -170,23 +170,21 @@ pub fn likeliest_names(scene: &Scene, grid: &Grid, most: usize) -> Result<Vec<Ve
         .collect();
     let of_object = |(place, object): (usize, &Object)| {
         let named = vocabulary.iter().zip(&scores);
-        // Every object looks like some class of the encoder, but the detector finds only what it
-        // knows, so its names are listed first.
-        let is_detected = |query: &TextQuery, score: f32| {
-            matches!(query.source, Source::Detector(_)) && score >= min_score
-        };
         let mut names: Vec<(bool, NameScore)> = named
             .filter(|_| !object.embeddings.is_empty())
             .map(|((name, query), scores)| {
                 let score = scores[place];
+                let is_detected = matches!(query.source, Source::Detector(_)) && score >= min_score;
                 let name = name.clone();
-                (is_detected(query, score), NameScore { name, score })
+                (is_detected, NameScore { name, score })
             })
             .collect();
-        names.sort_by(|(a_detected, a), (b_detected, b)| {
-            let by_score = b.score.total_cmp(&a.score);
-            b_detected.cmp(a_detected).then(by_score)
-        });
+        names.sort_by(|a, b| b.1.score.total_cmp(&a.1.score));
+        // Every object looks like some class of the encoder, but the detector finds only what it
+        // knows, so its best name is listed first.
+        if let Some(first) = names.iter().position(|(is_detected, _)| *is_detected) {
+            names[..=first].rotate_right(1);
+        }
         names.into_iter().map(|row| row.1).take(most).collect()
     };
     Ok(grid.objects.iter().enumerate().map(of_object).collect())
