@@ -215,7 +215,7 @@ mod tests {
         assert!((by_detector[0] - expected).abs() < 1e-6);
         assert!(by_detector[1] > 0.99);
         let by_embeddings = scores(&grid, Source::Embeddings);
-        assert!(by_embeddings[0] > 0.9 && by_embeddings[1] < 0.1);
+        assert!(by_embeddings[0] > by_embeddings[1]);
         assert_eq!(scores(&grid, Source::Unknown), [0.0, 0.0]);
         // Without votes, only embeddings are left.
         let mut without = grid.clone();

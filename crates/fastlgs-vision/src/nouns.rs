@@ -60,10 +60,14 @@ impl Nouns {
         Ok(Self(fs::read_json(&model_paths::offline_dir().join(FILE))?))
     }
 
-    /// Returns the classes that a name means. Colours and materials have no effect. A phrase that
-    /// is not in WordNet means what its last words mean: "office chair" is a chair.
+    /// Returns the classes that a name means. A phrase that is not in WordNet means what its last
+    /// words mean, without colours and materials: "office chair" is a chair.
     pub fn classes(&self, name: &str) -> NamedClasses {
-        let plain = attributes::of_text(&name.to_lowercase()).1;
+        let name = name.to_lowercase();
+        if let Some(classes) = self.entry(&name) {
+            return classes;
+        }
+        let plain = attributes::of_text(&name).1;
         let words: Vec<&str> = plain.split_whitespace().collect();
         let described = words
             .iter()
@@ -102,7 +106,8 @@ mod tests {
     #[test]
     fn phrases_and_plurals_mean_the_classes_of_their_noun() {
         let file = r#"{"chair": {"detector": [56]}, "armchair": {"detector": [56]}, "curtain": {"classifier": [794, 854]},
-            "picture frame": {}, "frame": {"classifier": [3]}, "carton": {"classifier": [478]}, "juice": {"classifier": [1]}}"#;
+            "picture frame": {}, "frame": {"classifier": [3]}, "carton": {"classifier": [478]}, "juice": {"classifier": [1]},
+            "chest": {"classifier": [2]}, "chest of drawers": {"classifier": [493]}, "brown bear": {"detector": [21]}, "bear": {}}"#;
         let nouns = Nouns(serde_json::from_str(file).expect("nouns"));
         let detector = |name: &str| {
             let classes = nouns.classes(name).detector;
@@ -121,6 +126,8 @@ mod tests {
         assert_eq!(detector("wine glasses"), ["wine glass"]);
         assert_eq!(nouns.classes("red curtain").classifier, [794, 854]);
         assert_eq!(nouns.classes("carton of juice").classifier, [478]);
+        assert_eq!(nouns.classes("chest of drawers").classifier, [493]);
+        assert_eq!(detector("brown bear"), ["bear"]);
         assert!(nouns.classes("picture frame").is_empty());
         assert!(nouns.classes("of").is_empty() && nouns.classes("").is_empty());
     }
