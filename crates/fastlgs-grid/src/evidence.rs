@@ -40,6 +40,8 @@ impl Evidence {
 /// Objects at least as near to a negative as to the query have rank -inf and score 0. The object
 /// that gave the example has rank inf and score 1.
 pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
+    // The law of absent names depends on the number of objects that are compared.
+    let compared = grid.objects.iter().filter(|object| is_seen(object)).count();
     match &query.source {
         _ if query.rule == Rule::Paper => of_objects(grid, |object, _| by_relevancy(object, query)),
         Source::Detector(classes) if grid.has_detections() => {
@@ -48,11 +50,13 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
         Source::Unknown if !query.is_known(grid) => {
             let unknown = |object: &Object, prior: f32| Evidence {
                 score: 0.0,
-                ..by_cosines(grid, object, prior, query)
+                ..by_cosines(object, prior, query, compared)
             };
             of_objects(grid, unknown)
         }
-        _ => of_objects(grid, |object, prior| by_cosines(grid, object, prior, query)),
+        _ => of_objects(grid, |object, prior| {
+            by_cosines(object, prior, query, compared)
+        }),
     }
 }
 
@@ -72,7 +76,7 @@ fn of_objects(grid: &Grid, of: impl Fn(&Object, f32) -> Evidence) -> Vec<Evidenc
 }
 
 /// Returns the evidence by the cosines of embeddings:
-/// rank = temperature * margin + ln prior.
+/// rank = temperature * margin + ln prior. `compared` is the number of objects with embeddings.
 ///
 /// The margin is cosine minus canonical cosine; the temperature comes from the
 /// [`crate::calibration::Calibration`]. The score depends on the margin alone: the object with the
@@ -82,7 +86,7 @@ fn of_objects(grid: &Grid, of: impl Fn(&Object, f32) -> Evidence) -> Vec<Evidenc
 /// the difference cancels that. Between the objects of a room, the regression of a text's cosine on
 /// the canonical cosine has a slope of 0.90 (`fastlgs-bench clip`). Without canonical phrases, the
 /// margin ranks like the cosine.
-fn by_cosines(grid: &Grid, object: &Object, prior: f32, query: &TextQuery) -> Evidence {
+fn by_cosines(object: &Object, prior: f32, query: &TextQuery, compared: usize) -> Evidence {
     let calibration = &query.calibration;
     let Some(margin) = margin(object, query) else {
         return Evidence::NONE;
@@ -90,14 +94,13 @@ fn by_cosines(grid: &Grid, object: &Object, prior: f32, query: &TextQuery) -> Ev
     if query.from_example && object.embeddings.iter().all(|e| query.positive.contains(e)) {
         return Evidence::CERTAIN;
     }
-    let seen = grid.objects.iter().filter(|object| is_seen(object)).count();
     let calibrated_margin = calibration.temperature * margin;
     let variance = mean_over_views(object, |e| (query.margin(e) - margin).powi(2))
         / object.embeddings.len() as f32;
     Evidence {
         rank: calibrated_margin + prior.ln(),
         calibrated_margin,
-        score: calibration.confidence(margin, seen),
+        score: calibration.confidence(margin, compared),
         error: calibration.temperature * variance.sqrt(),
     }
 }

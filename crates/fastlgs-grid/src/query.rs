@@ -144,9 +144,9 @@ pub fn best_score(ranked: &[Hit]) -> f32 {
 
 /// Returns the targets; empty means "not found".
 ///
-/// The first target is the object with the highest rank, if it is found. Others are added if they do not
-/// overlap a target. Their rank and calibrated margin may be lower than the first one's by at most
-/// the combined standard error.
+/// The first target is the object with the highest rank, if it is found. Others are added if they
+/// do not overlap a target. Their rank and calibrated margin may be lower than the first one's by at
+/// most the combined standard error.
 ///
 /// The calibrated margin must agree as well. Size alone may make a large object the first target,
 /// but not a further one.

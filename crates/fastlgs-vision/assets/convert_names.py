@@ -139,9 +139,9 @@ PHYSICAL, ANIMAL = "00001930", "00015568"
 ANIMALS = 398
 # A noun that covers a larger share of all classes names none of them.
 BROADEST = 0.2
-# Share of the kinds of an artefact that the classifier must know to know its name: two pianos of three stand for
-# pianos, but a sliding door does not stand for doors. Kinds of animals, plants and food look alike, and the detector
-# finds nothing where it knows nothing.
+# The classifier knows the name of an artefact if it has classes for this share of its kinds: it knows two of three
+# kinds of piano, but only one of twelve kinds of door. Kinds of animals, plants and food look alike. The detector
+# finds nothing where it has no class.
 FEWEST_KINDS = 0.5
 # WordNet's file of artefacts.
 ARTEFACTS = "06"

@@ -13,6 +13,7 @@ pub mod crops;
 pub mod detector;
 pub mod edges;
 pub mod encoder;
+mod environment;
 pub mod histogram;
 pub mod import;
 pub mod inpaint;

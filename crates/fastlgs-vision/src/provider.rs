@@ -1,5 +1,6 @@
 //! Execution providers of ONNX Runtime: the hardware that runs the models.
 
+use crate::environment::environment;
 use crate::{Error, Result};
 use ort::ep::{self, ExecutionProvider, ExecutionProviderDispatch};
 use serde::{Deserialize, Serialize};
@@ -137,7 +138,7 @@ impl Provider {
 /// # Errors
 /// ONNX Runtime is not installed or cannot be loaded.
 pub fn built_in() -> Result<Vec<Provider>> {
-    crate::runtime::load_library()?;
+    environment()?;
     let mut found = vec![Provider::Cpu];
     found.extend(
         Provider::ACCELERATED

@@ -1,45 +1,13 @@
-//! Runs ONNX models. ONNX Runtime is loaded from a shared library, or linked in with the feature
-//! `download-ort`.
+//! Runs ONNX models.
 
+use crate::environment::environment;
 use crate::provider::Provider;
 use crate::{Error, Result, model_paths};
 use half::f16;
-use ort::environment::Environment;
 use ort::session::Session;
 use ort::value::{DynValue, Tensor, TensorElementType, ValueType};
 use std::path::Path;
 use std::sync::Mutex;
-
-static ENVIRONMENT: Mutex<Option<Environment>> = Mutex::new(None);
-
-/// Returns the process-wide environment, and creates it on first use.
-fn environment() -> Result<Environment> {
-    let mut slot = ENVIRONMENT.lock().expect("no panic while holding the lock");
-    if let Some(environment) = slot.as_ref() {
-        return Ok(environment.clone());
-    }
-    let library = model_paths::runtime_library()?;
-    let failed = |e: &dyn std::fmt::Display| {
-        Error::Missing(format!(
-            "{}: ONNX Runtime cannot be loaded: {e}",
-            library.display()
-        ))
-    };
-    #[cfg(feature = "load-ort")]
-    let builder = ort::init_from(&library).map_err(|e| failed(&e))?;
-    #[cfg(not(feature = "load-ort"))]
-    let builder = ort::init();
-    let environment = builder
-        .with_name("fastlgs")
-        .build()
-        .map_err(|e| failed(&e))?;
-    Ok(slot.insert(environment).clone())
-}
-
-/// Loads ONNX Runtime, if no model did so before.
-pub(crate) fn load_library() -> Result<()> {
-    environment().map(|_| ())
-}
 
 fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
@@ -107,7 +75,7 @@ fn open(path: &Path, threads: usize, provider: Provider) -> Result<Session> {
 /// Opens the first session of a model on the chosen provider, and returns both. `Auto` becomes the
 /// first provider that works.
 fn first_session(path: &Path, threads: usize) -> Result<(Provider, Session)> {
-    load_library()?;
+    environment()?;
     let chosen = Provider::chosen();
     if chosen == Provider::Auto {
         let built_in = Provider::AUTOMATIC.into_iter().filter(|p| p.is_built_in());

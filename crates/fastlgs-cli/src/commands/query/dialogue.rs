@@ -1,6 +1,7 @@
 //! Interactive dialogue: `fastlgs query SCENE -` on a terminal.
 
-use super::{QueryRunner, answer_text};
+use super::QueryRunner;
+use super::answer_text::answer_text;
 use crate::outcome::Outcome;
 use crate::ui::print_line;
 use anyhow::{Result, bail};
