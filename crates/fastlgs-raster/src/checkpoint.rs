@@ -118,7 +118,7 @@ pub(crate) fn load(path: &Path) -> Result<Option<(TrainingState, State, Vec<f32>
             )
         })
     };
-    let sh_degree = training.config.sh_degree;
+    let sh_degree = training.config.degree(training.iteration);
     let rows = channels(sh_degree);
     let state = State {
         sh_degree,

@@ -133,6 +133,15 @@ impl State {
         *self = self.gathered(&sources);
     }
 
+    /// Raises the SH degree. The new coefficients and their moments are 0.
+    pub(crate) fn raise_degree(&mut self, degree: u32) {
+        let values = channels(degree) * self.len();
+        for column in [&mut self.params, &mut self.moment1, &mut self.moment2] {
+            column.resize(values, 0.0);
+        }
+        self.sh_degree = degree;
+    }
+
     /// Sorts the Gaussians along a Morton curve. Neighbours in memory are then mostly neighbours in
     /// images, so a step reads contiguous memory.
     pub(crate) fn sort_along_curve(&mut self) {

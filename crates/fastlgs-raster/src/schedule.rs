@@ -79,6 +79,9 @@ pub struct TrainerConfig {
     pub background: [f32; 3],
     /// Whether the background colour is learned.
     pub learn_background: bool,
+    /// Whether the learning rates suit the number of iterations. If not, they are those of 3DGS.
+    #[serde(default)]
+    pub scaled_rates: bool,
     /// Whether an affine exposure is learned for each training view.
     pub exposure: bool,
     /// Whether the cameras of the training views are aligned.
@@ -92,7 +95,7 @@ pub struct TrainerConfig {
 
 impl TrainerConfig {
     /// Returns this configuration for Gaussians that are already trained: no density control, full
-    /// resolution, and no price on opacity.
+    /// resolution, no price on opacity, and the learning rates of 3DGS.
     #[must_use]
     pub fn for_refinement(self) -> Self {
         Self {
@@ -102,13 +105,14 @@ impl TrainerConfig {
             depth_weight: 0.0,
             mean_opacity_weight: 0.0,
             max_dropout: 0.0,
+            scaled_rates: false,
             ..self
         }
     }
 
     /// Returns this configuration with the schedule of 3DGS: full resolution, growth from step 500
-    /// to the middle of 30,000 steps, opacity resets instead of a price on opacity, and nothing for
-    /// few photos.
+    /// to the middle of 30,000 steps, opacity resets instead of a price on opacity, its learning
+    /// rates, and nothing for few photos.
     #[must_use]
     pub fn with_schedule_of_3dgs(self) -> Self {
         Self {
@@ -118,6 +122,7 @@ impl TrainerConfig {
             depth_weight: 0.0,
             mean_opacity_weight: 0.0,
             max_dropout: 0.0,
+            scaled_rates: false,
             ..self
         }
     }
@@ -144,12 +149,22 @@ impl Default for TrainerConfig {
             antialias: false,
             background: [0.0; 3],
             learn_background: false,
+            scaled_rates: true,
             exposure: false,
             alignment: Alignment::Off,
             couples_at: None,
         }
     }
 }
+
+/// Number of iterations for which 3DGS chose its learning rates.
+const ITERATIONS_OF_3DGS: f32 = 30_000.0;
+/// Largest factor on the learning rates of a short run.
+const MAX_RATE_FACTOR: f32 = 5.0;
+/// Share of the iterations after which scaled learning rates decay.
+const DECAY_FROM: f32 = 0.5;
+/// Factor on scaled learning rates at the end of the run.
+const FINAL_DECAY: f32 = 0.1;
 
 /// Share of the iterations after which density control begins.
 fn default_refine_from() -> f32 {
@@ -196,22 +211,43 @@ impl TrainerConfig {
         (self.iterations as f32 * share) as u32
     }
 
-    /// Returns the learning rates of 3DGS for a scene of size `extent`.
+    /// Returns the learning rates for a scene of size `extent`: those of 3DGS, scaled for short runs.
     ///
     /// The rates of means and features decay exponentially to a hundredth. At a constant 1e-2, two
     /// steps would move a feature farther than the paper's tau_ac. It would also oscillate where
     /// views disagree.
+    ///
+    /// Scaled rates grow with the root of the missing iterations, so that a short run moves
+    /// Gaussians as far as a long one. The rate of opacity is not scaled: with a larger one, the
+    /// price on opacity removes faint walls.
     pub(crate) fn rates(&self, iteration: u32, extent: f32) -> Rates {
         let mut rates = [0.0; BASE_CHANNELS + 1];
         let decay = 0.01f32.powf(self.progress(iteration));
-        rates[channel::MEAN].fill(1.6e-4 * extent * decay);
-        rates[channel::LOG_SCALE].fill(5e-3);
-        rates[channel::ROTATION].fill(1e-3);
-        rates[channel::OPACITY] = 5e-2;
-        rates[channel::COLOR].fill(5e-3);
+        let (factor, late_decay) = if self.scaled_rates {
+            (self.rate_factor(), self.late_decay(iteration))
+        } else {
+            (1.0, 1.0)
+        };
+        rates[channel::MEAN].fill(1.6e-4 * extent * factor * decay);
+        rates[channel::LOG_SCALE].fill(5e-3 * factor * late_decay);
+        rates[channel::ROTATION].fill(1e-3 * factor * late_decay);
+        rates[channel::OPACITY] = 5e-2 * late_decay;
+        rates[channel::COLOR].fill(5e-3 * factor * late_decay);
         rates[channel::FEATURE].fill(1e-2 * decay);
-        rates[BASE_CHANNELS] = 5e-3 / 20.0;
+        rates[BASE_CHANNELS] = 5e-3 / 20.0 * factor * late_decay;
         rates
+    }
+
+    /// Returns the factor on the learning rates of 3DGS for this number of iterations.
+    fn rate_factor(&self) -> f32 {
+        let missing = ITERATIONS_OF_3DGS / self.iterations.max(1) as f32;
+        missing.sqrt().clamp(1.0, MAX_RATE_FACTOR)
+    }
+
+    /// Returns the factor by which scaled learning rates have decayed.
+    fn late_decay(&self, iteration: u32) -> f32 {
+        let late = (self.progress(iteration) - DECAY_FROM) / (1.0 - DECAY_FROM);
+        FINAL_DECAY.powf(late.max(0.0))
     }
 
     /// Returns the SH degree in use: one more every 1,000 steps as in 3DGS, sooner in short runs.
@@ -400,8 +436,20 @@ mod tests {
             long.resets_opacity(3000) && long.resets_opacity(9000) && !long.resets_opacity(12_000)
         );
         assert!(config.prunes(3600) && config.prunes(5200) && !config.prunes(5201));
-        let (first, last) = (config.rates(0, 2.0)[0], config.rates(8000, 2.0)[0]);
-        assert!((first - 3.2e-4).abs() < 1e-8 && (last - first / 100.0).abs() < 1e-8);
+        let [first, middle, last] = [0, 4000, 8000].map(|i| config.rates(i, 2.0));
+        // sqrt(30,000 / 8,000) times the rates of 3DGS.
+        let factor = 3.75f32.sqrt();
+        assert!((first[0] - factor * 3.2e-4).abs() < 1e-8);
+        assert!((last[0] - first[0] / 100.0).abs() < 1e-8);
+        let colour = channel::COLOR.start;
+        assert!((middle[colour] - factor * 5e-3).abs() < 1e-8);
+        assert!((last[colour] - 0.1 * middle[colour]).abs() < 1e-8);
+        assert!((middle[channel::OPACITY] - 5e-2).abs() < 1e-8);
+        let short = TrainerConfig {
+            iterations: 100,
+            ..config.clone()
+        };
+        assert!((short.rates(0, 2.0)[0] - MAX_RATE_FACTOR * 3.2e-4).abs() < 1e-8);
         assert_eq!(
             [3599, 3600].map(|i| config.opacity_weight(i, 1, 0.5)),
             [0.5 * config.mean_opacity_weight, 0.0]

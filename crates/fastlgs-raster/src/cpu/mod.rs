@@ -50,7 +50,7 @@ pub(crate) use footprint::span;
 pub use gather_counts::gather_counts;
 pub use loss_gradient::loss_gradient;
 pub use project::project;
-pub(crate) use project::{NOT_DRAWN, Projected, project_one};
+pub(crate) use project::{NOT_DRAWN, project_one};
 pub(crate) use project_backward::backward_one;
 pub use project_backward::project_backward;
 pub use radix_count::radix_count;

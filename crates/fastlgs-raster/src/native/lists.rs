@@ -1,7 +1,7 @@
 //! Projection, depth order and tile lists.
 
 use super::simd::{AHEAD, prefetch, vectorised};
-use crate::cpu::{self, Footprint, NOT_DRAWN, Projected, Splat, span};
+use crate::cpu::{self, Footprint, NOT_DRAWN, Splat, span};
 use crate::view::View;
 use rayon::prelude::*;
 
@@ -47,15 +47,16 @@ const PARTS: usize = 16;
 impl Lists {
     /// Builds the lists of a view from trained values `[n][channels]`.
     pub fn new(view: &View, params: &[f32]) -> Self {
-        let projected = project(view, params);
-        let bands = bands(view, &projected);
-        let (first, positions) = positions(&bands, projected.len());
-        let reach = projected
+        let projection = Projection::new(view, params);
+        let bands = bands(view, &projection);
+        let (first, positions) = positions(&bands, projection.splats.len());
+        let reach = projection
+            .footprints
             .par_iter()
-            .map(|p| p.footprint[1][0].sqrt() + ROUNDING)
+            .map(|footprint| footprint[1][0].sqrt() + ROUNDING)
             .collect();
         Self {
-            splats: splats(&projected),
+            splats: projection.splats,
             reach,
             bands,
             positions,
@@ -66,7 +67,7 @@ impl Lists {
     /// Projects the Gaussians again and keeps the lists. Only values that do not move geometry may
     /// have changed.
     pub fn refresh(&mut self, view: &View, params: &[f32]) {
-        self.splats = splats(&project(view, params));
+        self.splats = Projection::new(view, params).splats;
     }
 
     /// Returns the size of the lists in bytes.
@@ -131,28 +132,52 @@ impl Band {
 /// Number of Gaussians that one task projects.
 const BLOCK: usize = 256;
 
-/// Projects all Gaussians from trained values `[n][channels]`.
-fn project(view: &View, params: &[f32]) -> Vec<Projected> {
-    let nothing = Projected {
-        splat: [[0.0; 4]; 3],
-        depth: NOT_DRAWN,
-        footprint: [[0.0; 4]; 2],
-    };
-    let mut projected = vec![nothing; view.gaussians as usize];
-    let width = (params.len() / projected.len().max(1)).max(1);
-    projected
-        .par_chunks_mut(BLOCK)
-        .zip(params.par_chunks(BLOCK * width))
-        .enumerate()
-        .for_each(|(block, (out, params))| {
-            project_block(view, (block * BLOCK) as u32, width, params, out)
-        });
-    projected
+/// All Gaussians of a view, projected. One vector for each purpose, because a step reads each of
+/// them alone.
+struct Projection {
+    splats: Vec<Splat>,
+    /// Depth keys; [`NOT_DRAWN`] for Gaussians that are not drawn.
+    depths: Vec<u32>,
+    footprints: Vec<Footprint>,
+}
+
+impl Projection {
+    /// Projects all Gaussians from trained values `[n][channels]`.
+    fn new(view: &View, params: &[f32]) -> Self {
+        let n = view.gaussians as usize;
+        let mut all = Self {
+            splats: vec![[[0.0; 4]; 3]; n],
+            depths: vec![NOT_DRAWN; n],
+            footprints: vec![[[0.0; 4]; 2]; n],
+        };
+        let width = (params.len() / n.max(1)).max(1);
+        let splats = all.splats.par_chunks_mut(BLOCK);
+        let depths = all.depths.par_chunks_mut(BLOCK);
+        let footprints = all.footprints.par_chunks_mut(BLOCK);
+        let blocks = params
+            .par_chunks(BLOCK * width)
+            .zip(splats.zip(depths.zip(footprints)));
+        blocks
+            .enumerate()
+            .for_each(|(block, (params, (splats, (depths, footprints))))| {
+                let first = (block * BLOCK) as u32;
+                project_block(view, first, width, params, splats, depths, footprints)
+            });
+        all
+    }
 }
 
 vectorised! {
-    /// Projects the Gaussians from index `first` on. On entry `out` marks all of them as not drawn.
-    fn project_block(view: &View, first: u32, width: usize, params: &[f32], out: &mut [Projected]) = project_block_body
+    /// Projects the Gaussians from index `first` on. On entry all of them are marked as not drawn.
+    fn project_block(
+        view: &View,
+        first: u32,
+        width: usize,
+        params: &[f32],
+        splats: &mut [Splat],
+        depths: &mut [u32],
+        footprints: &mut [Footprint],
+    ) = project_block_body
 }
 
 #[inline(always)]
@@ -161,24 +186,21 @@ fn project_block_body<const FMA: bool>(
     first: u32,
     width: usize,
     params: &[f32],
-    out: &mut [Projected],
+    splats: &mut [Splat],
+    depths: &mut [u32],
+    footprints: &mut [Footprint],
 ) {
-    for (g, (params, out)) in (first..).zip(params.chunks_exact(width).zip(out)) {
-        if let Some(drawn) = cpu::project_one(view, g, |c| params[c]) {
-            *out = drawn;
+    for (k, params) in params.chunks_exact(width).enumerate() {
+        if let Some(drawn) = cpu::project_one(view, first + k as u32, |c| params[c]) {
+            (splats[k], depths[k], footprints[k]) = (drawn.splat, drawn.depth, drawn.footprint);
         }
     }
 }
 
-fn splats(projected: &[Projected]) -> Vec<Splat> {
-    projected.par_iter().map(|p| p.splat).collect()
-}
-
 /// Returns the drawn Gaussians by ascending depth. Equal depths are ordered by index.
-fn in_depth_order(projected: &[Projected]) -> Vec<u32> {
-    let depths: Vec<u32> = projected.par_iter().map(|p| p.depth).collect();
+fn in_depth_order(depths: &[u32]) -> Vec<u32> {
     let drawn = (0..)
-        .zip(&depths)
+        .zip(depths)
         .filter(|(_, depth)| **depth != NOT_DRAWN)
         .map(|(g, _)| g)
         .collect();
@@ -211,11 +233,11 @@ fn by_digit(order: &[u32], digit: impl Fn(u32) -> usize) -> Vec<u32> {
 }
 
 /// Builds the rows of tiles, each with its Gaussians in depth order.
-fn bands(view: &View, projected: &[Projected]) -> Vec<Band> {
-    let order = in_depth_order(projected);
+fn bands(view: &View, projection: &Projection) -> Vec<Band> {
+    let order = in_depth_order(&projection.depths);
     let touched = |gaussians: &[u32]| {
         let mut rows: Vec<Vec<Touch>> = (0..view.tiles[1]).map(|_| Vec::new()).collect();
-        touches(view, projected, gaussians, &mut rows);
+        touches(view, &projection.footprints, gaussians, &mut rows);
         rows
     };
     let parts: Vec<Vec<Vec<Touch>>> = order
@@ -234,21 +256,21 @@ const ROWS: usize = 8;
 
 vectorised! {
     /// Appends each Gaussian to the rows of tiles that it touches, in the order of `gaussians`.
-    fn touches(view: &View, projected: &[Projected], gaussians: &[u32], rows: &mut [Vec<Touch>]) = touches_body
+    fn touches(view: &View, footprints: &[Footprint], gaussians: &[u32], rows: &mut [Vec<Touch>]) = touches_body
 }
 
 #[inline(always)]
 fn touches_body<const FMA: bool>(
     view: &View,
-    projected: &[Projected],
+    footprints: &[Footprint],
     gaussians: &[u32],
     rows: &mut [Vec<Touch>],
 ) {
     for (k, &gaussian) in gaussians.iter().enumerate() {
         if let Some(later) = gaussians.get(k + AHEAD) {
-            prefetch(&projected[*later as usize].footprint);
+            prefetch(&footprints[*later as usize]);
         }
-        let footprint: &Footprint = &projected[gaussian as usize].footprint;
+        let footprint = &footprints[gaussian as usize];
         let end = (footprint[1][3] as u32).min(view.tiles[1]);
         for first in (footprint[1][2] as u32..end).step_by(ROWS) {
             let (mut starts, mut ends) = ([0; ROWS], [0; ROWS]);
@@ -295,29 +317,16 @@ mod tests {
     use super::*;
     use fastlgs_core::rng::Rng;
 
-    /// Returns a Gaussian that has only a depth and a footprint.
-    fn projected_at(depth: u32, footprint: Footprint) -> Projected {
-        Projected {
-            splat: [[0.0; 4]; 3],
-            depth,
-            footprint,
-        }
-    }
-
     #[test]
     fn depths_are_sorted_and_ties_keep_their_order() {
         let mut rng = Rng::new(3, "depths");
         let mut depths = vec![0, NOT_DRAWN, 0xfff, 0x1000, NOT_DRAWN - 1, 0xfff, 0, 0x1001];
         depths.extend((0..500).map(|_| (rng.uniform() * 300.0) as u32 * 0x777));
-        let projected: Vec<Projected> = depths
-            .iter()
-            .map(|depth| projected_at(*depth, [[0.0; 4]; 2]))
-            .collect();
         let mut expected: Vec<u32> = (0..depths.len() as u32)
             .filter(|g| depths[*g as usize] != NOT_DRAWN)
             .collect();
         expected.sort_by_key(|g| depths[*g as usize]);
-        assert_eq!(in_depth_order(&projected), expected);
+        assert_eq!(in_depth_order(&depths), expected);
         assert!(in_depth_order(&[]).is_empty());
     }
 
@@ -338,12 +347,12 @@ mod tests {
             round(88.0, 148.0, 30.0),
             round(45.0, 75.0, 300.0),
         ];
-        let projected: Vec<Projected> = footprints
-            .iter()
-            .zip([4, 3, 2, 1])
-            .map(|(footprint, depth)| projected_at(depth, *footprint))
-            .collect();
-        let bands = bands(&view, &projected);
+        let projection = Projection {
+            splats: vec![[[0.0; 4]; 3]; 4],
+            depths: vec![4, 3, 2, 1],
+            footprints: footprints.to_vec(),
+        };
+        let bands = bands(&view, &projection);
         assert_eq!(bands.len(), 19);
         for (row, band) in (0..).zip(&bands) {
             let [first, end] = [2, 3].map(|k| footprints.map(|f| f[1][k] as u32));

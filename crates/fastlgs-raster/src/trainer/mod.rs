@@ -108,7 +108,7 @@ impl Trainer {
                 "nothing to train: there are no points or no training views".to_owned(),
             ));
         }
-        engine.set_state(&State::of(&scene.clone().with_sh_degree(config.sh_degree)))?;
+        engine.set_state(&State::of(&scene.clone().with_sh_degree(config.degree(0))))?;
         if config.exposure {
             targets = targets.without_clipped();
         }
@@ -252,7 +252,20 @@ impl Trainer {
             }
         }
         self.training.iteration += 1;
+        let next_degree = config.degree(iteration + 1);
+        if next_degree > degree {
+            self.raise_degree(next_degree)?;
+        }
         Ok(())
+    }
+
+    /// Adds the SH coefficients up to `degree`. Steps are faster without those that are not in use
+    /// yet.
+    fn raise_degree(&mut self, degree: u32) -> Result<()> {
+        let (mut state, stats) = (self.engine.state()?, self.engine.stats()?);
+        state.raise_degree(degree);
+        self.engine.set_state(&state)?;
+        self.engine.set_stats(&stats)
     }
 
     /// Runs a round of density control.

@@ -44,6 +44,8 @@ pub fn settings(
         antialias: config.antialias,
         background: background.color,
         learn_background: background.learn,
+        // Large steps would first undo what the given Gaussians have learned.
+        scaled_rates: config.init.is_none(),
         exposure: config
             .exposure
             .is_on(brightness.spread_stops >= MIN_BRIGHTNESS_SPREAD),
