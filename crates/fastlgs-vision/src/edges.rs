@@ -17,7 +17,7 @@ impl Hed {
     /// When it is not installed.
     pub fn load() -> Result<Self> {
         Ok(Self(Model::load_for_each_core(
-            &model_paths::offline_dir().join("edges.onnx"),
+            &model_paths::offline_dir().join("edges8.onnx"),
         )?))
     }
 

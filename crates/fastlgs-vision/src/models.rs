@@ -53,7 +53,7 @@ pub const OFFLINE_FILES: [&str; 6] = [
     "classifier.onnx",
     "text.onnx",
     "tokenizer.json",
-    "edges.onnx",
+    "edges8.onnx",
     "classes.json",
     CLIP_MERGES,
 ];
