@@ -217,8 +217,8 @@ impl TrainerConfig {
     /// steps would move a feature farther than the paper's tau_ac. It would also oscillate where
     /// views disagree.
     ///
-    /// Scaled rates grow with the root of the missing iterations, so that a short run moves
-    /// Gaussians as far as a long one. The rate of opacity is not scaled: with a larger one, the
+    /// n steps of length r in random directions go about r sqrt(n) far. So scaled rates are
+    /// proportional to 1 / sqrt(iterations), and a short run goes as far as one of 3DGS. The rate of opacity is not scaled: with a larger one, the
     /// price on opacity removes faint walls.
     pub(crate) fn rates(&self, iteration: u32, extent: f32) -> Rates {
         let mut rates = [0.0; BASE_CHANNELS + 1];

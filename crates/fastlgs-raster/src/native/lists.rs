@@ -154,45 +154,48 @@ impl Projection {
         let splats = all.splats.par_chunks_mut(BLOCK);
         let depths = all.depths.par_chunks_mut(BLOCK);
         let footprints = all.footprints.par_chunks_mut(BLOCK);
-        let blocks = params
-            .par_chunks(BLOCK * width)
-            .zip(splats.zip(depths.zip(footprints)));
-        blocks
-            .enumerate()
-            .for_each(|(block, (params, (splats, (depths, footprints))))| {
-                let first = (block * BLOCK) as u32;
-                project_block(view, first, width, params, splats, depths, footprints)
-            });
+        let blocks = splats.zip(depths).zip(footprints).enumerate();
+        blocks.zip(params.par_chunks(BLOCK * width)).for_each(
+            |((block, ((splats, depths), footprints)), params)| {
+                let out = ProjectedBlock {
+                    first: (block * BLOCK) as u32,
+                    splats,
+                    depths,
+                    footprints,
+                };
+                project_block(view, width, params, out)
+            },
+        );
         all
     }
 }
 
+/// Neighbouring Gaussians of a [`Projection`] that one task projects.
+struct ProjectedBlock<'a> {
+    /// Index of the first one.
+    first: u32,
+    splats: &'a mut [Splat],
+    depths: &'a mut [u32],
+    footprints: &'a mut [Footprint],
+}
+
 vectorised! {
-    /// Projects the Gaussians from index `first` on. On entry all of them are marked as not drawn.
-    fn project_block(
-        view: &View,
-        first: u32,
-        width: usize,
-        params: &[f32],
-        splats: &mut [Splat],
-        depths: &mut [u32],
-        footprints: &mut [Footprint],
-    ) = project_block_body
+    /// Projects the Gaussians of a block. On entry all of them are marked as not drawn.
+    fn project_block(view: &View, width: usize, params: &[f32], out: ProjectedBlock) = project_block_body
 }
 
 #[inline(always)]
 fn project_block_body<const FMA: bool>(
     view: &View,
-    first: u32,
     width: usize,
     params: &[f32],
-    splats: &mut [Splat],
-    depths: &mut [u32],
-    footprints: &mut [Footprint],
+    out: ProjectedBlock,
 ) {
     for (k, params) in params.chunks_exact(width).enumerate() {
-        if let Some(drawn) = cpu::project_one(view, first + k as u32, |c| params[c]) {
-            (splats[k], depths[k], footprints[k]) = (drawn.splat, drawn.depth, drawn.footprint);
+        if let Some(drawn) = cpu::project_one(view, out.first + k as u32, |c| params[c]) {
+            out.splats[k] = drawn.splat;
+            out.depths[k] = drawn.depth;
+            out.footprints[k] = drawn.footprint;
         }
     }
 }

@@ -252,20 +252,7 @@ impl Trainer {
             }
         }
         self.training.iteration += 1;
-        let next_degree = config.degree(iteration + 1);
-        if next_degree > degree {
-            self.raise_degree(next_degree)?;
-        }
         Ok(())
-    }
-
-    /// Adds the SH coefficients up to `degree`. Steps are faster without those that are not in use
-    /// yet.
-    fn raise_degree(&mut self, degree: u32) -> Result<()> {
-        let (mut state, stats) = (self.engine.state()?, self.engine.stats()?);
-        state.raise_degree(degree);
-        self.engine.set_state(&state)?;
-        self.engine.set_stats(&stats)
     }
 
     /// Runs a round of density control.
@@ -301,11 +288,10 @@ impl Trainer {
         self.replace(&state)
     }
 
-    /// Lowers all opacities; those that no photo needs stay low. The statistics of gradients are
-    /// kept.
-    fn reset_opacity(&mut self) -> Result<()> {
+    /// Changes the trained values of the Gaussians, and keeps the statistics of their gradients.
+    fn edit_state(&mut self, edit: impl FnOnce(&mut State)) -> Result<()> {
         let (mut state, stats) = (self.engine.state()?, self.engine.stats()?);
-        density::reset_opacity(&mut state, 0.01);
+        edit(&mut state);
         self.engine.set_state(&state)?;
         self.engine.set_stats(&stats)
     }
@@ -441,14 +427,20 @@ impl Trainer {
         })
     }
 
-    /// Runs the steps that are due after an iteration: density control, opacity reset, alignment
-    /// and pruning.
+    /// Runs the steps that are due after an iteration: a higher SH degree, density control, opacity
+    /// reset, alignment and pruning.
     fn run_scheduled(&mut self, iteration: u32) -> Result<()> {
+        let degree = self.training.config.degree(iteration);
+        if degree > self.training.config.degree(iteration - 1) {
+            // Steps are faster without coefficients that are not in use yet.
+            self.edit_state(|state| state.raise_degree(degree))?;
+        }
         if self.training.config.refines(iteration) {
             self.refine()?;
         }
         if self.training.config.resets_opacity(iteration) {
-            self.reset_opacity()?;
+            // Opacities that no photo needs stay low.
+            self.edit_state(|state| density::reset_opacity(state, 0.01))?;
         }
         if self.training.config.aligns(iteration) {
             self.align()?;
