@@ -1,7 +1,8 @@
 //! Brightness of photos relative to each other, measured from the colours of matched key points.
 
+use crate::conjugate_gradients;
 use crate::tracks::PairMatches;
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DVector;
 use std::collections::BTreeSet;
 
 /// Smallest number of matches from which the brightness of two photos is compared.
@@ -12,10 +13,10 @@ const DARK: f32 = 8.0;
 const CLIPPED: f32 = 250.0;
 /// Weight, in matches, of the prior that the brightness of a photo equals its apparent brightness.
 /// It matters only for photos and groups that no match connects to the others.
-const APPEARANCE_PRIOR_WEIGHT: f32 = 1e-2;
+const APPEARANCE_PRIOR_WEIGHT: f64 = 1e-2;
 /// Weight, in matches, of the prior that all channels of a photo differ from other photos by the
 /// same number of stops. It matters for a channel that is clipped at white.
-const CHANNEL_PRIOR_WEIGHT: f32 = 1.0;
+const CHANNEL_PRIOR_WEIGHT: f64 = 1.0;
 
 fn median(values: &mut [f32]) -> Option<f32> {
     values.sort_by(f32::total_cmp);
@@ -33,7 +34,7 @@ pub struct Brightness {
 }
 
 /// First photo, second photo, by how many stops the first is brighter, and the number of matches.
-type Difference = (usize, usize, f32, f32);
+type Difference = (usize, usize, f64, f64);
 
 /// Compares photos by the colours of matched key points. `colors` holds the colours of each photo's
 /// key points.
@@ -50,14 +51,20 @@ pub fn compare(colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Brightness {
             if count < MIN_BRIGHTNESS_MATCHES {
                 None
             } else {
-                median(&mut stops).map(|stops| (m.a, m.b, stops, count as f32))
+                median(&mut stops).map(|stops| (m.a, m.b, f64::from(stops), count as f64))
             }
         };
         matches.iter().filter_map(difference).collect()
     };
     let channels: [Vec<Difference>; 3] = std::array::from_fn(of_channel);
     let spread = |differences: &Vec<Difference>| {
-        median(&mut differences.iter().map(|d| d.2.abs()).collect::<Vec<_>>()).unwrap_or(0.0)
+        median(
+            &mut differences
+                .iter()
+                .map(|d| d.2.abs() as f32)
+                .collect::<Vec<_>>(),
+        )
+        .unwrap_or(0.0)
     };
     let looks = apparent_stops(colors);
     // A photo may look bright only because it shows bright surfaces. Apparent brightness is
@@ -73,19 +80,19 @@ pub fn compare(colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Brightness {
     });
     let stops = solve_stops(
         &channels,
-        &(looks * (common / own.max(f32::MIN_POSITIVE)).clamp(0.0, 1.0)),
+        &(looks * (common / own.max(f64::MIN_POSITIVE)).clamp(0.0, 1.0)),
     );
     Brightness {
         spread_stops: channels.iter().map(spread).fold(0.0, f32::max),
         gains: (0..colors.len())
-            .map(|photo| [0, 1, 2].map(|c| stops[3 * photo + c].exp2()))
+            .map(|photo| [0, 1, 2].map(|c| stops[3 * photo + c].exp2() as f32))
             .collect(),
     }
 }
 
 /// Returns by how many stops the key points of each photo look brighter than the mean of all
 /// photos, for each channel: `[photo][3]`.
-fn apparent_stops(colors: &[Vec<[u8; 3]>]) -> DVector<f32> {
+fn apparent_stops(colors: &[Vec<[u8; 3]>]) -> DVector<f64> {
     let of = |photo: &Vec<[u8; 3]>, c: usize| {
         median(
             &mut photo
@@ -99,40 +106,46 @@ fn apparent_stops(colors: &[Vec<[u8; 3]>]) -> DVector<f32> {
         let of_photos: Vec<Option<f32>> = colors.iter().map(|photo| of(photo, c)).collect();
         let mean = of_photos.iter().flatten().sum::<f32>()
             / of_photos.iter().flatten().count().max(1) as f32;
-        of_photos
-            .iter()
-            .enumerate()
-            .for_each(|(photo, look)| looks[3 * photo + c] = look.map_or(0.0, |look| look - mean));
+        of_photos.iter().enumerate().for_each(|(photo, look)| {
+            looks[3 * photo + c] = look.map_or(0.0, |look| f64::from(look - mean));
+        });
     }
     looks
 }
 
 /// Returns the stops of each photo's channels, `[photo][3]`, that fit all differences best (least
 /// squares). Each channel has a mean of 0. Photos without differences get their apparent stops.
-fn solve_stops(channels: &[Vec<Difference>; 3], looks: &DVector<f32>) -> DVector<f32> {
-    let mut normal = DMatrix::<f32>::identity(looks.len(), looks.len()) * APPEARANCE_PRIOR_WEIGHT;
+fn solve_stops(channels: &[Vec<Difference>; 3], looks: &DVector<f64>) -> DVector<f64> {
+    let measured = channels.iter().enumerate().flat_map(|(c, differences)| {
+        let of = move |&(a, b, stops, count): &Difference| (3 * a + c, 3 * b + c, stops, count);
+        differences.iter().map(of)
+    });
+    let equal = (0..looks.len()).step_by(3).flat_map(|red| {
+        let pairs = [(0, 1), (1, 2), (2, 0)];
+        pairs.map(|(a, b)| (red + a, red + b, 0.0, CHANNEL_PRIOR_WEIGHT))
+    });
+    let differences: Vec<Difference> = measured.chain(equal).collect();
+    let mut diagonal = DVector::from_element(looks.len(), APPEARANCE_PRIOR_WEIGHT);
     let mut right = looks * APPEARANCE_PRIOR_WEIGHT;
-    let mut add_difference = |a: usize, b: usize, stops: f32, weight: f32| {
-        (normal[(a, a)], normal[(b, b)]) = (normal[(a, a)] + weight, normal[(b, b)] + weight);
-        (normal[(a, b)], normal[(b, a)]) = (normal[(a, b)] - weight, normal[(b, a)] - weight);
-        (right[a], right[b]) = (right[a] + weight * stops, right[b] - weight * stops);
+    for &(a, b, stops, weight) in &differences {
+        diagonal[a] += weight;
+        diagonal[b] += weight;
+        right[a] += weight * stops;
+        right[b] -= weight * stops;
+    }
+    let product = |x: &DVector<f64>| {
+        let mut y = x.component_mul(&diagonal);
+        for &(a, b, _, weight) in &differences {
+            y[a] -= weight * x[b];
+            y[b] -= weight * x[a];
+        }
+        y
     };
-    for (c, differences) in channels.iter().enumerate() {
-        differences
-            .iter()
-            .for_each(|&(a, b, stops, weight)| add_difference(3 * a + c, 3 * b + c, stops, weight));
-    }
-    for red in (0..looks.len()).step_by(3) {
-        [(0, 1), (1, 2), (2, 0)]
-            .into_iter()
-            .for_each(|(a, b)| add_difference(red + a, red + b, 0.0, CHANNEL_PRIOR_WEIGHT));
-    }
-    let mut stops = normal.cholesky().map_or_else(
-        || DVector::zeros(looks.len()),
-        |factors| factors.solve(&right),
-    );
+    let precondition = |r: &DVector<f64>| r.component_div(&diagonal);
+    let mut stops = conjugate_gradients::solve(product, precondition, &right, 1e-6)
+        .expect("the prior makes the matrix positive definite");
     for c in 0..3 {
-        let mean = stops.iter().skip(c).step_by(3).sum::<f32>() / (looks.len() / 3).max(1) as f32;
+        let mean = stops.iter().skip(c).step_by(3).sum::<f64>() / (looks.len() / 3).max(1) as f64;
         stops
             .iter_mut()
             .skip(c)

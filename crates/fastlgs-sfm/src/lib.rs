@@ -7,10 +7,12 @@
 
 pub mod brightness;
 pub mod bundle;
+mod conjugate_gradients;
 pub mod depth_map;
 pub mod frame;
 pub mod keypoints;
 pub mod matching;
+mod neighbours;
 pub mod photo_quality;
 mod plane;
 pub mod pose_check;

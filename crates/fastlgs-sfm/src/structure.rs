@@ -6,6 +6,7 @@
 
 use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
+use crate::neighbours;
 use crate::process_output::lines;
 use crate::tracks::PairMatches;
 use crate::{Error, Result};
@@ -26,10 +27,10 @@ use std::time::Duration;
 const CAMERA_MODEL: &str = "SIMPLE_RADIAL";
 /// Largest number of photos for which all pairs are matched.
 const EXHAUSTIVE: usize = 120;
-/// With more photos, each is matched with this many that follow it by name, and with those at
-/// distances of powers of two.
-const FOLLOWING: usize = 12;
-/// In addition, all pairs of this many evenly spread photos are matched, to close loops.
+/// With more photos, each is matched with this many that are most similar.
+const SIMILAR: usize = 20;
+/// In addition, all pairs of this many evenly spread photos are matched. In a video, the most
+/// similar photos are those just before and after, which do not close loops.
 const LOOP_PHOTOS: usize = 40;
 /// Largest longer side, in pixels, of the images for key point detection.
 const STRUCTURE_SIDE: u32 = 1000;
@@ -370,7 +371,7 @@ fn matched(
             pairs: matches(points[a], points[b]),
         })
     };
-    let all = pairs(points.len())
+    let all = pairs(points)
         .into_par_iter()
         .map(of_pair)
         .collect::<Result<Vec<_>>>()?;
@@ -380,17 +381,17 @@ fn matched(
         .collect())
 }
 
-/// Returns the pairs of photos to match, as indices in the order of names.
-fn pairs(count: usize) -> Vec<(usize, usize)> {
+/// Returns the pairs of photos to match.
+fn pairs(points: &[&Keypoints]) -> Vec<(usize, usize)> {
+    let count = points.len();
     if count <= EXHAUSTIVE {
         return (0..count)
             .flat_map(|a| (a + 1..count).map(move |b| (a, b)))
             .collect();
     }
     let mut pairs = BTreeSet::new();
-    for a in 0..count {
-        let near = (1..=FOLLOWING).chain((0..).map(|k| 1usize << k).take_while(|d| *d < count));
-        pairs.extend(near.map(|d| (a, a + d)).filter(|p| p.1 < count));
+    for (a, others) in neighbours::of_each(points, SIMILAR).into_iter().enumerate() {
+        pairs.extend(others.into_iter().map(|b| (a.min(b), a.max(b))));
     }
     let spread: Vec<usize> = (0..LOOP_PHOTOS).map(|k| k * count / LOOP_PHOTOS).collect();
     pairs.extend(
@@ -481,6 +482,8 @@ fn run(command: &mut Command, stage: &str, progress: &impl Fn(&str, &str) -> boo
 #[cfg(all(test, unix))]
 mod tests {
     use super::*;
+    use fastlgs_core::rng::Rng;
+    use glam::Vec2;
     use std::os::unix::fs::PermissionsExt;
     use std::sync::Mutex;
 
@@ -602,22 +605,34 @@ mod tests {
     }
 
     #[test]
-    fn many_photos_are_matched_with_neighbours_and_across_loops() {
-        assert_eq!(pairs(4), [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]);
-        let many = pairs(300);
-        assert!(
-            many.contains(&(10, 11)) && many.contains(&(10, 22)) && many.contains(&(10, 138)),
-            "neighbours and distances of powers of two must be matched"
+    fn many_photos_are_matched_with_similar_ones_and_across_loops() {
+        let mut rng = Rng::new(3, "views");
+        let descriptors: Vec<[u8; 128]> = (0..3300)
+            .map(|_| std::array::from_fn(|_| rng.below(256) as u8))
+            .collect();
+        // Photos along a wall, in shuffled order: neighbours share nine tenths of their points.
+        let place = |photo: usize| photo * 77 % 300;
+        let photos: Vec<Keypoints> = (0..300)
+            .map(|photo| Keypoints {
+                positions: vec![Vec2::ZERO; 100],
+                descriptors: descriptors[10 * place(photo)..][..100].to_vec(),
+            })
+            .collect();
+        let photos: Vec<&Keypoints> = photos.iter().collect();
+        assert_eq!(
+            pairs(&photos[..4]),
+            [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
         );
+        let many = pairs(&photos);
+        let near = |reach: usize| {
+            let within = |(a, b): &&(usize, usize)| place(*a).abs_diff(place(*b)) <= reach;
+            many.iter().filter(within).count()
+        };
+        assert!(near(3) > 3 * 300 * 98 / 100, "{} pairs", near(3));
         assert!(
             many.contains(&(0, 292)),
-            "the first and the last of the spread photos must be matched"
+            "evenly spread photos must be matched"
         );
-        assert!(
-            many.len() < 20 * 300 + LOOP_PHOTOS * LOOP_PHOTOS / 2,
-            "{} pairs of {}",
-            many.len(),
-            300 * 299 / 2
-        );
+        assert!(many.len() < 300 * SIMILAR + LOOP_PHOTOS * LOOP_PHOTOS / 2);
     }
 }

@@ -17,7 +17,7 @@ use rayon::prelude::*;
 
 /// Version of the embeddings; those of different versions cannot be compared. Raise it when a mask
 /// gets another embedding.
-pub const VERSION: u32 = 3;
+pub const VERSION: u32 = 4;
 
 /// Length of an embedding: 384 values of MiniLM, then [`attributes`] and [`appearance`].
 pub const LENGTH: usize = 384 + attributes::COUNT + appearance::COUNT;
@@ -61,7 +61,7 @@ impl Conse {
     /// When they are not installed.
     pub fn load() -> Result<Self> {
         let folder = model_paths::offline_dir();
-        let classifier = Model::load_for_each_core(&folder.join("classifier.onnx"))?;
+        let classifier = Model::load_for_each_core(&folder.join("classifier8.onnx"))?;
         let class_embeddings = names::embeddings()?;
         let mut rng = Rng::new(0, "dense projection");
         let projection = class_embeddings

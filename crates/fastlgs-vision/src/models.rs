@@ -50,7 +50,7 @@ const TOOLS: [&str; 5] = [
 
 /// Files that `install-offline` writes to [`offline_dir`].
 pub const OFFLINE_FILES: [&str; 6] = [
-    "classifier.onnx",
+    "classifier8.onnx",
     "text.onnx",
     "tokenizer.json",
     "edges8.onnx",

@@ -54,6 +54,19 @@ pub struct Model {
     sessions: Vec<Mutex<Session>>,
 }
 
+/// Returns whether the processor adds products of 8-bit numbers in 32 bits. Older x86 processors
+/// add two of them in 16 bits, which do not suffice.
+fn has_dot_products() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    let found = [
+        is_x86_feature_detected!("avx512vnni"),
+        is_x86_feature_detected!("avxvnni"),
+    ];
+    #[cfg(not(target_arch = "x86_64"))]
+    let found = [true];
+    found.contains(&true)
+}
+
 /// Opens a session of a model on a provider.
 fn open(path: &Path, threads: usize, provider: Provider) -> Result<Session> {
     let failed = |e: &dyn std::fmt::Display| Error::Inference {
@@ -64,6 +77,9 @@ fn open(path: &Path, threads: usize, provider: Provider) -> Result<Session> {
         .map_err(|e| failed(&e))?
         .with_intra_threads(threads)
         .map_err(|e| failed(&e))?;
+    if !has_dot_products() {
+        builder = builder.with_precise_qmm().map_err(|e| failed(&e))?;
+    }
     if let Some(dispatch) = provider.dispatch() {
         builder = builder
             .with_execution_providers([dispatch])

@@ -10,7 +10,7 @@ use fastlgs_core::{LabelMap, Level, MaskList, image_io};
 use image::RgbImage;
 
 /// Version of [`OfflineSegmenter`]. Increase it whenever the same photo gets other masks.
-pub const VERSION: u32 = 3;
+pub const VERSION: u32 = 4;
 
 /// Finds masks in photos.
 pub trait Segmenter: Sync {

@@ -1,7 +1,8 @@
 //! Bundle adjustment (Triggs et al. 2000): refines cameras, their lenses and points together.
 //!
 //! It minimises the reprojection error of the key points. Levenberg-Marquardt solves for the
-//! cameras; the Schur complement eliminates the points. Cauchy's loss reduces the weight of wrong
+//! cameras; the Schur complement eliminates the points. Its blocks are sparse, and conjugate
+//! gradients solve it (Agarwal et al. 2010). Cauchy's loss reduces the weight of wrong
 //! matches.
 
 mod problem;
@@ -341,5 +342,68 @@ mod tests {
             report.focal[0]
         );
         assert!(adjust(&mut cameras, &keypoints, &[]).is_none());
+    }
+
+    /// Returns cameras along a wall, and their key points and matches. Each camera sees a hundred
+    /// points, and shares half of them with the fifth one after it.
+    fn along_a_wall(count: usize) -> (Vec<Camera>, Vec<Keypoints>, Vec<PairMatches>) {
+        const SHIFT: f32 = 0.4;
+        let mut rng = Rng::new(5, "wall");
+        let points: Vec<Vec3> = (0..10 * count + 90)
+            .map(|k| {
+                Vec3::new(
+                    SHIFT * 0.1 * k as f32,
+                    rng.range(-1.5, 1.5),
+                    rng.range(3.0, 5.0),
+                )
+            })
+            .collect();
+        let camera = |k: usize| {
+            let eye = Vec3::new(SHIFT * (k as f32 + 5.0), 0.0, 0.0);
+            Camera::look_at(
+                &format!("{k:04}"),
+                eye,
+                eye + Vec3::Z,
+                Vec3::Y,
+                320,
+                240,
+                0.8,
+            )
+        };
+        let cameras: Vec<Camera> = (0..count).map(camera).collect();
+        let mut noise = || 0.5 * Vec2::new(rng.normal(), rng.normal());
+        let key_points = |(k, c): (usize, &Camera)| Keypoints {
+            positions: points[10 * k..10 * k + 100]
+                .iter()
+                .map(|p| c.to_pixel(c.world_to_camera.transform_point3(*p)) + noise())
+                .collect(),
+            descriptors: vec![[0; 128]; 100],
+        };
+        let keypoints = cameras.iter().enumerate().map(key_points).collect();
+        let near = |a: usize| (a + 1..count.min(a + 6)).map(move |b| (a, b));
+        let matched = |(a, b): (usize, usize)| PairMatches {
+            a,
+            b,
+            pairs: (10 * (b - a)..100).map(|i| (i, i - 10 * (b - a))).collect(),
+        };
+        let matches = (0..count).flat_map(near).map(matched).collect();
+        (cameras, keypoints, matches)
+    }
+
+    #[test]
+    fn hundreds_of_photos_are_adjusted() {
+        let (truth, keypoints, matches) = along_a_wall(700);
+        let mut cameras = truth.clone();
+        let mut rng = Rng::new(8, "poses");
+        for camera in &mut cameras {
+            let turn = 0.006 * Vec3::new(rng.normal(), rng.normal(), rng.normal());
+            camera.world_to_camera =
+                Mat4::from_quat(Quat::from_scaled_axis(turn)) * camera.world_to_camera;
+        }
+        let before = mean_rotation_difference(&cameras, &truth);
+        let report = adjust(&mut cameras, &keypoints, &matches).unwrap();
+        let after = mean_rotation_difference(&cameras, &truth);
+        assert!(after < 0.2 * before, "{before} px before, {after} after");
+        assert!(report.error[1] < 0.7, "{report:?}");
     }
 }

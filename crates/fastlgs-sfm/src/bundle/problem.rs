@@ -1,9 +1,11 @@
 //! The equations of bundle adjustment, and their solution by Levenberg-Marquardt.
 
+use crate::conjugate_gradients;
 use fastlgs_core::Camera;
 use glam::{DMat3, DMat4, DQuat, DVec2, DVec3};
-use nalgebra::{DMatrix, DVector, Matrix2x3, SMatrix, SVector};
+use nalgebra::{DVector, Matrix2x3, SMatrix, SVector};
 use rayon::prelude::*;
+use std::collections::BTreeMap;
 
 /// Prior standard deviation of a lens: of the logarithm of its focal length, and of k1.
 const LENS_DEVIATION: f64 = 0.1;
@@ -11,6 +13,9 @@ const LENS_DEVIATION: f64 = 0.1;
 const MIN_OBSERVATIONS: usize = 20;
 /// Scale of Cauchy's loss in pixels: larger errors count less.
 const LOSS_SCALE: f64 = 1.0;
+/// Relative accuracy of a Levenberg-Marquardt step. More accurate steps take longer and gain
+/// nothing, because the equations are only linear near the current values.
+const STEP_TOLERANCE: f64 = 1e-2;
 /// Largest number of Levenberg-Marquardt steps in a round.
 const BUNDLE_STEPS: usize = 12;
 
@@ -56,6 +61,8 @@ const POSE_PARAMETERS: usize = 6;
 const CAMERA_PARAMETERS: usize = POSE_PARAMETERS + 2;
 /// Derivatives of a pixel by rotation, translation and lens of its camera.
 type ByCamera = SMatrix<f64, 2, CAMERA_PARAMETERS>;
+/// Block of the normal matrix that couples the parameters of two cameras.
+type CameraBlock = SMatrix<f64, CAMERA_PARAMETERS, CAMERA_PARAMETERS>;
 /// Block of the normal matrix that couples the parameters of a camera with a point.
 type Coupling = SMatrix<f64, CAMERA_PARAMETERS, 3>;
 
@@ -131,8 +138,26 @@ impl Values {
 
 /// Normal equations of the cameras after elimination of the points (Schur complement).
 struct Reduced {
-    matrix: DMatrix<f64>,
+    /// Blocks of the matrix, by their two cameras, the first one not above the second one. The
+    /// block at (b, a) is the transpose of that at (a, b).
+    blocks: BTreeMap<(usize, usize), CameraBlock>,
+    /// What is added to the diagonal: priors and damping.
+    added: DVector<f64>,
     right: DVector<f64>,
+}
+
+impl Reduced {
+    fn new(width: usize) -> Self {
+        Self {
+            blocks: BTreeMap::new(),
+            added: DVector::zeros(width),
+            right: DVector::zeros(width),
+        }
+    }
+
+    fn add(&mut self, cameras: (usize, usize), block: CameraBlock) {
+        *self.blocks.entry(cameras).or_insert_with(SMatrix::zeros) += block;
+    }
 }
 
 impl Problem<'_> {
@@ -259,10 +284,7 @@ impl Problem<'_> {
             .par_chunks(size)
             .zip(values.points.par_chunks(size)))
         .map(|(seen, points)| {
-            let mut reduced = Reduced {
-                matrix: DMatrix::zeros(width, width),
-                right: DVector::zeros(width),
-            };
+            let mut reduced = Reduced::new(width);
             let eliminated = seen
                 .iter()
                 .zip(points)
@@ -273,13 +295,12 @@ impl Problem<'_> {
             (reduced, eliminated)
         })
         .collect();
-        let mut all = Reduced {
-            matrix: DMatrix::zeros(width, width),
-            right: DVector::zeros(width),
-        };
+        let mut all = Reduced::new(width);
         let mut eliminated = Vec::new();
         for (reduced, some) in parts {
-            all.matrix += reduced.matrix;
+            for (cameras, block) in reduced.blocks {
+                all.add(cameras, block);
+            }
             all.right += reduced.right;
             eliminated.extend(some);
         }
@@ -304,34 +325,20 @@ impl Problem<'_> {
             own += by_point.transpose() * by_point;
             right -= by_point.transpose() * residual;
             couplings.push((o.view, by_camera.transpose() * by_point));
-            let columns = self.columns(o.view);
-            let (normal, side) = (
-                by_camera.transpose() * by_camera,
-                by_camera.transpose() * residual,
+            reduced.add((o.view, o.view), by_camera.transpose() * by_camera);
+            self.scatter(
+                o.view,
+                -by_camera.transpose() * residual,
+                &mut reduced.right,
             );
-            for (r, row) in columns.into_iter().enumerate() {
-                reduced.right[row] -= side[r];
-                columns
-                    .iter()
-                    .enumerate()
-                    .for_each(|(c, column)| reduced.matrix[(row, *column)] += normal[(r, c)]);
-            }
         }
         (0..3).for_each(|k| own[(k, k)] *= 1.0 + damping);
         let inverse = own.try_inverse().unwrap_or_else(SMatrix::zeros);
         for (view, coupling) in &couplings {
             let through = coupling * inverse;
-            let (rows, side) = (self.columns(*view), through * right);
-            rows.iter()
-                .enumerate()
-                .for_each(|(r, row)| reduced.right[*row] -= side[r]);
-            for (other, back) in &couplings {
-                let (columns, product) = (self.columns(*other), through * back.transpose());
-                for (c, column) in columns.into_iter().enumerate() {
-                    rows.iter()
-                        .enumerate()
-                        .for_each(|(r, row)| reduced.matrix[(*row, column)] -= product[(r, c)]);
-                }
+            self.scatter(*view, -through * right, &mut reduced.right);
+            for (other, back) in couplings.iter().filter(|(other, _)| view <= other) {
+                reduced.add((*view, *other), -through * back.transpose());
             }
         }
         Eliminated {
@@ -341,40 +348,112 @@ impl Problem<'_> {
         }
     }
 
+    /// Adds the values of a view and its lens to `all`.
+    fn scatter(
+        &self,
+        view: usize,
+        values: SVector<f64, CAMERA_PARAMETERS>,
+        all: &mut DVector<f64>,
+    ) {
+        let columns = self.columns(view).into_iter();
+        columns.zip(&values).for_each(|(k, v)| all[k] += v);
+    }
+
+    /// Returns the values of a view and its lens.
+    fn gather(&self, view: usize, all: &DVector<f64>) -> SVector<f64, CAMERA_PARAMETERS> {
+        SVector::from(self.columns(view).map(|k| all[k]))
+    }
+
+    /// Returns the diagonal of the matrix.
+    fn diagonal(&self, reduced: &Reduced) -> DVector<f64> {
+        let mut diagonal = reduced.added.clone();
+        for ((a, b), block) in &reduced.blocks {
+            if a == b {
+                self.scatter(*a, block.diagonal(), &mut diagonal);
+            }
+        }
+        diagonal
+    }
+
+    /// Solves the reduced equations. Parameters that do not move get 0. Returns `None` if the
+    /// matrix is not positive definite.
+    fn solve_reduced(&self, reduced: &Reduced, moves: &[bool]) -> Option<DVector<f64>> {
+        let masked = |mut x: DVector<f64>| {
+            x.iter_mut()
+                .zip(moves)
+                .filter(|(_, moves)| !**moves)
+                .for_each(|(x, _)| *x = 0.0);
+            x
+        };
+        let product = |x: &DVector<f64>| {
+            let mut y = x.component_mul(&reduced.added);
+            for (&(a, b), block) in &reduced.blocks {
+                self.scatter(a, block * self.gather(b, x), &mut y);
+                if a != b {
+                    self.scatter(b, block.tr_mul(&self.gather(a, x)), &mut y);
+                }
+            }
+            masked(y)
+        };
+        // The preconditioner inverts the block of each pose and the diagonal of the lenses.
+        let lenses_at = POSE_PARAMETERS * self.cameras.len();
+        let of_lenses = self.diagonal(reduced);
+        let of_pose = |view: usize| {
+            let added = reduced.added.fixed_rows(POSE_PARAMETERS * view);
+            let mut own = SMatrix::<f64, POSE_PARAMETERS, POSE_PARAMETERS>::from_diagonal(&added);
+            if let Some(block) = reduced.blocks.get(&(view, view)) {
+                own += block.fixed_view::<POSE_PARAMETERS, POSE_PARAMETERS>(0, 0);
+            }
+            own.try_inverse().unwrap_or_else(SMatrix::identity)
+        };
+        let of_poses: Vec<_> = (0..self.cameras.len()).map(of_pose).collect();
+        let precondition = |r: &DVector<f64>| {
+            let mut better = r.clone();
+            for (view, inverse) in of_poses.iter().enumerate() {
+                let at = POSE_PARAMETERS * view;
+                let own = inverse * r.fixed_rows::<POSE_PARAMETERS>(at);
+                better.fixed_rows_mut::<POSE_PARAMETERS>(at).copy_from(&own);
+            }
+            for k in lenses_at..r.len() {
+                better[k] = r[k] / of_lenses[k].max(f64::MIN_POSITIVE);
+            }
+            masked(better)
+        };
+        let right = masked(reduced.right.clone());
+        conjugate_gradients::solve(product, precondition, &right, STEP_TOLERANCE)
+    }
+
     /// Takes at most `BUNDLE_STEPS` Levenberg-Marquardt steps; stops when the relative gain is below 1e-4.
     pub fn solve(&self, values: &mut Values) {
         let (mut damping, mut cost) = (1e-4, self.cost(values));
         let mut counts = vec![0; self.cameras.len()];
         self.seen.iter().flatten().for_each(|o| counts[o.view] += 1);
+        let lenses_at = POSE_PARAMETERS * self.cameras.len();
+        // Parameters without enough data stay fixed: cameras with few observations, lenses that
+        // are not adjusted.
+        let moves: Vec<bool> = (0..self.width(values))
+            .map(|k| match k < lenses_at {
+                true => counts[k / POSE_PARAMETERS] >= MIN_OBSERVATIONS,
+                false => (k - lenses_at) / 2 < values.lenses.len(),
+            })
+            .collect();
         for _ in 0..BUNDLE_STEPS {
             let (mut reduced, eliminated) = self.eliminate(values, damping);
             for (l, lens) in values.lenses.iter().enumerate() {
                 for (k, value) in [lens.log_focal, lens.k1].into_iter().enumerate() {
-                    let column = POSE_PARAMETERS * self.cameras.len() + 2 * l + k;
-                    reduced.matrix[(column, column)] += 1.0 / (LENS_DEVIATION * LENS_DEVIATION);
+                    let column = lenses_at + 2 * l + k;
+                    reduced.added[column] += 1.0 / (LENS_DEVIATION * LENS_DEVIATION);
                     reduced.right[column] -= value / (LENS_DEVIATION * LENS_DEVIATION);
                 }
             }
-            for k in 0..reduced.right.len() {
-                let moves = k >= POSE_PARAMETERS * self.cameras.len()
-                    || counts[k / POSE_PARAMETERS] >= MIN_OBSERVATIONS;
-                // Parameters without enough data stay fixed: cameras with few observations, lenses
-                // that are not adjusted.
-                if !moves || reduced.matrix[(k, k)] <= 0.0 {
-                    reduced.matrix.row_mut(k).fill(0.0);
-                    reduced.matrix.column_mut(k).fill(0.0);
-                    (reduced.matrix[(k, k)], reduced.right[k]) = (1.0, 0.0);
-                }
-                reduced.matrix[(k, k)] *= 1.0 + damping;
-            }
-            let Some(factors) = reduced.matrix.cholesky() else {
+            reduced.added += damping * self.diagonal(&reduced);
+            let Some(step) = self.solve_reduced(&reduced, &moves) else {
                 damping *= 10.0;
                 continue;
             };
-            let step = factors.solve(&reduced.right);
             let points: Vec<DVec3> = eliminated
                 .iter()
-                .map(|e| e.step(&step, |view| self.columns(view)))
+                .map(|e| e.step(|view| self.gather(view, &step)))
                 .collect();
             let next = values.stepped(&step, &points);
             let new_cost = self.cost(&next);
@@ -401,16 +480,11 @@ struct Eliminated {
 }
 
 impl Eliminated {
-    fn step(
-        &self,
-        cameras: &DVector<f64>,
-        columns: impl Fn(usize) -> [usize; CAMERA_PARAMETERS],
-    ) -> DVec3 {
+    /// Returns the step of the point; `of_camera` returns the step of a camera.
+    fn step(&self, of_camera: impl Fn(usize) -> SVector<f64, CAMERA_PARAMETERS>) -> DVec3 {
         let mut right = self.right;
         for (view, coupling) in &self.couplings {
-            let of_camera =
-                SVector::<f64, CAMERA_PARAMETERS>::from(columns(*view).map(|k| cameras[k]));
-            right -= coupling.transpose() * of_camera;
+            right -= coupling.transpose() * of_camera(*view);
         }
         let step = self.inverse * right;
         DVec3::new(step[0], step[1], step[2])

@@ -469,9 +469,6 @@ fn detect_small(folder: &SceneFolder, cameras: &[Camera], run: &Run) -> Result<V
     Ok(points)
 }
 
-/// Largest number of photos for which [`Poses::Check`] adjusts all cameras. Time grows with the
-/// cube of their number.
-const MAX_ADJUSTED_PHOTOS: usize = 600;
 /// Displacement at the corners, in pixels, above which a found distortion is removed from the
 /// photos. A smaller distortion stays, because resampling reduces sharpness.
 const MAX_CORNER_SHIFT: f32 = 1.0;
@@ -496,13 +493,6 @@ pub(super) fn adjust(
     run: &Run,
     warnings: &mut Vec<String>,
 ) -> Result<Option<Adjusted>> {
-    if photos.len() > MAX_ADJUSTED_PHOTOS && asked != Poses::Refine {
-        let warning = format!(
-            "poses and lenses of more than {MAX_ADJUSTED_PHOTOS} photos are not adjusted, because it takes long; set 'poses' to 'refine' to adjust them"
-        );
-        super::warn(run, warnings, warning);
-        return Ok(None);
-    }
     let mut cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     let points: Vec<Keypoints> = photos.iter().map(|p| p.points.clone()).collect();
     let work = run.work("bundle adjustment", 0);
