@@ -286,10 +286,10 @@ impl<'a> Observations<'a> {
         masks: impl Iterator<Item = MaskId>,
         scratch: &mut Scratch,
     ) -> Vec<u32> {
-        let (mut met, mut asked) = (Vec::new(), vec![false; self.tables.len()]);
+        let (mut met, mut asked) = (Vec::new(), vec![0.0; self.tables.len()]);
         for mask in masks {
             let view = self.view_of(mask);
-            asked[view] = true;
+            asked[view] = 1.0;
             let held = &self.view_masks[view];
             for (g, pixels) in held.atoms[(mask - held.first) as usize]
                 .iter()
@@ -301,13 +301,7 @@ impl<'a> Observations<'a> {
         let mut met = sorted_unique(met);
         met.retain(|g| {
             let inside = std::mem::take(&mut scratch.gaussians[*g as usize]);
-            let shown: f32 = self
-                .votes_of(*g)
-                .iter()
-                .filter(|v| asked[usize::from(v.view)])
-                .map(|v| v.weight.pixels())
-                .sum();
-            2.0 * inside > shown
+            2.0 * inside > weight_in(self.votes_of(*g), &asked)
         });
         met
     }
@@ -364,6 +358,18 @@ impl<'a> Observations<'a> {
             });
         views.filter(|shown| shown.pixels >= MIN_PIXELS).collect()
     }
+}
+
+/// Returns the weight of votes in pixels, each times the factor of its view.
+fn weight_in(votes: &[Vote], factors: &[f32]) -> f32 {
+    // Without branches, and with four sums side by side: this loop takes much of the mapping's time.
+    let weighted = |vote: &Vote| factors[usize::from(vote.view)] * vote.weight.pixels();
+    let (fours, rest) = votes.as_chunks::<4>();
+    let mut sums = [0.0f32; 4];
+    for four in fours {
+        (0..4).for_each(|k| sums[k] += weighted(&four[k]));
+    }
+    sums.iter().sum::<f32>() + rest.iter().map(weighted).sum::<f32>()
 }
 
 /// Adds `weight` to `sums[of]`, and appends `of` to `met` if the sum was 0.

@@ -29,7 +29,7 @@ const MIN_CORRELATION: f32 = 0.7;
 /// Smallest difference between the best correlation and that at any other depth.
 const MIN_SCORE_MARGIN: f32 = 0.05;
 /// Planes up to this distance from the best one count as the same depth.
-const SAME_DEPTH_PLANES: usize = 3;
+const SAME_DEPTH_PLANES: u32 = 3;
 /// Smallest standard deviation of a patch, in grey values of 255. Smaller ones are noise.
 const MIN_PATCH_DEVIATION: f32 = 3.0;
 /// Number of other photos that must find the same depth, within one pixel.
@@ -206,19 +206,14 @@ fn depths(views: &[View], view: usize, neighbours: &[usize]) -> Vec<f32> {
             .zip(second)
             .for_each(|(best, second)| *best = 0.5 * (*best + second));
     }
+    let (best_planes, elsewhere) = best_planes(&scores, w * h);
     for (pixel, depth) in out.iter_mut().enumerate() {
         let score = |plane: usize| scores[plane * w * h + pixel];
-        let best = (0..PLANES)
-            .max_by(|a, b| score(*a).total_cmp(&score(*b)))
-            .unwrap_or(0);
-        let elsewhere = (0..PLANES)
-            .filter(|p| p.abs_diff(best) > SAME_DEPTH_PLANES)
-            .map(score)
-            .fold(-1.0, f32::max);
+        let best = best_planes[pixel] as usize;
         if best == 0
             || best == PLANES - 1
             || score(best) < MIN_CORRELATION
-            || score(best) - elsewhere < MIN_SCORE_MARGIN
+            || score(best) - elsewhere[pixel] < MIN_SCORE_MARGIN
             || patches.deviation[pixel] < MIN_PATCH_DEVIATION
         {
             continue;
@@ -229,6 +224,28 @@ fn depths(views: &[View], view: usize, neighbours: &[usize]) -> Vec<f32> {
         *depth = 1.0 / inverse(best as f32 + shift.clamp(-0.5, 0.5));
     }
     out
+}
+
+/// Returns for each pixel the plane with the largest score, the last one of equal ones, and the
+/// largest score of planes at other depths. `scores` is `[plane][pixel]`.
+fn best_planes(scores: &[f32], pixels: usize) -> (Vec<u32>, Vec<f32>) {
+    let (mut planes, mut top) = (vec![0u32; pixels], vec![f32::NEG_INFINITY; pixels]);
+    for (plane, scores) in (0..).zip(scores.chunks_exact(pixels)) {
+        for ((best, top), score) in planes.iter_mut().zip(&mut top).zip(scores) {
+            if score >= top {
+                (*best, *top) = (plane, *score);
+            }
+        }
+    }
+    let mut elsewhere = vec![-1.0f32; pixels];
+    for (plane, scores) in (0u32..).zip(scores.chunks_exact(pixels)) {
+        for ((elsewhere, best), score) in elsewhere.iter_mut().zip(&planes).zip(scores) {
+            if plane.abs_diff(*best) > SAME_DEPTH_PLANES {
+                *elsewhere = elsewhere.max(*score);
+            }
+        }
+    }
+    (planes, elsewhere)
 }
 
 /// Mean and standard deviation of the patch around each pixel.
@@ -283,8 +300,13 @@ impl Buffers {
     }
 }
 
-/// Warps `other` into `own` for a plane at `depth`: grey values, NaN outside of `other`.
-fn warp(own: &View, other: &View, depth: f32, out: &mut [f32]) {
+vectorised! {
+    /// Warps `other` into `own` for a plane at `depth`: grey values, NaN outside of `other`.
+    fn warp(own: &View, other: &View, depth: f32, out: &mut [f32]) = warp_body
+}
+
+#[inline(always)]
+fn warp_body<const FMA: bool>(own: &View, other: &View, depth: f32, out: &mut [f32]) {
     let relative = other.camera.world_to_camera * own.camera.world_to_camera.inverse();
     // A ray r (z = 1) of `own` at this depth has the direction R r + t / depth in `other`.
     let (turn, shift) = (
@@ -293,32 +315,39 @@ fn warp(own: &View, other: &View, depth: f32, out: &mut [f32]) {
     );
     let (w, h) = (other.width(), other.height());
     let step = turn * (own.camera.ray(Vec2::new(1.0, 0.0)) - own.camera.ray(Vec2::ZERO));
+    let camera = &other.camera;
+    let (most_x, most_y) = ((w - 1) as f32, (h - 1) as f32);
+    let mut places = vec![[0.0f32; 2]; own.width()];
     for (y, row) in out.chunks_exact_mut(own.width()).enumerate() {
         let first = turn * own.camera.ray(Vec2::new(0.5, y as f32 + 0.5)) + shift;
-        for (x, value) in row.iter_mut().enumerate() {
-            let q = first + x as f32 * step;
-            let p = other.camera.to_pixel(q) - 0.5;
-            let inside = q.z > 0.0
-                && p.x >= 0.0
-                && p.y >= 0.0
-                && p.x < (w - 1) as f32
-                && p.y < (h - 1) as f32;
-            if !inside {
-                *value = f32::NAN;
-                continue;
-            }
-            let (x0, y0) = (p.x as usize, p.y as usize);
-            let (u, v) = (p.x - x0 as f32, p.y - y0 as f32);
-            let at = y0 * w + x0;
-            let [a, b, c, d] = [
-                other.grey[at],
-                other.grey[at + 1],
-                other.grey[at + w],
-                other.grey[at + w + 1],
-            ];
-            *value = (a * (1.0 - u) + b * u) * (1.0 - v) + (c * (1.0 - u) + d * u) * v;
+        // This loop is vectorised; the next one, which reads the photo, is not.
+        for (x, place) in places.iter_mut().enumerate() {
+            let x = x as f32;
+            let z = first.z + x * step.z;
+            let u = camera.fx * (first.x + x * step.x) / z + camera.cx - 0.5;
+            let v = camera.fy * (first.y + x * step.y) / z + camera.cy - 0.5;
+            let inside = (z > 0.0) & (u >= 0.0) & (v >= 0.0) & (u < most_x) & (v < most_y);
+            *place = if inside { [u, v] } else { [f32::NAN; 2] };
+        }
+        for (value, [u, v]) in row.iter_mut().zip(&places) {
+            *value = if u.is_nan() {
+                f32::NAN
+            } else {
+                bilinear(&other.grey, w, *u, *v)
+            };
         }
     }
+}
+
+/// Interpolates between the four pixels around a place, whose upper left one is at (u, v) rounded
+/// down.
+#[inline(always)]
+fn bilinear(grey: &[f32], w: usize, u: f32, v: f32) -> f32 {
+    let (x, y) = (u as usize, v as usize);
+    let (u, v) = (u - x as f32, v - y as f32);
+    let at = y * w + x;
+    let [a, b, c, d] = [grey[at], grey[at + 1], grey[at + w], grey[at + w + 1]];
+    (a * (1.0 - u) + b * u) * (1.0 - v) + (c * (1.0 - u) + d * u) * v
 }
 
 vectorised! {

@@ -28,8 +28,6 @@ const TOP: usize = 10;
 const CROP_SIDE: usize = 260;
 /// Number of dimensions of a projected dense map.
 pub const DENSE: usize = 32;
-/// Number of masks in one inference.
-const BATCH: usize = 4;
 
 /// Features of a grid of cells that covers a photo.
 #[derive(Clone, Debug)]
@@ -178,28 +176,20 @@ impl Conse {
             .filter_map(|l| Some((l, boxes[usize::from(l)]?)))
             .collect();
         let views = [Surround::Neutral, Surround::Context];
-        let cut = |&(label, bounds): &(u16, [u32; 4])| {
-            views.map(|s| crops::crop(photo, masks, label, bounds, CROP_SIDE, s))
-        };
-        let of_batch = |batch: &[(u16, [u32; 4])]| -> Result<Vec<Vec<f32>>> {
-            let logits = self.logits(&batch.iter().flat_map(cut).collect::<Vec<_>>())?;
-            let classes = logits.shape[1];
-            let mean = |pair: &[f32]| -> Vec<f32> {
-                (0..classes)
-                    .map(|k| 0.5 * (pair[k] + pair[classes + k]))
-                    .collect()
-            };
-            Ok(logits
-                .values
-                .chunks_exact(views.len() * classes)
-                .map(mean)
+        let of_mask = |&(label, bounds): &(u16, [u32; 4])| -> Result<Vec<f32>> {
+            let crops = views.map(|s| crops::crop(photo, masks, label, bounds, CROP_SIDE, s));
+            let logits = self.logits(&crops)?;
+            let (alone, within) = logits.values.split_at(logits.shape[1]);
+            Ok(alone
+                .iter()
+                .zip(within)
+                .map(|(a, b)| 0.5 * (a + b))
                 .collect())
         };
         let logits = present
-            .par_chunks(BATCH)
-            .map(of_batch)
-            .collect::<Result<Vec<_>>>()?
-            .concat();
+            .par_iter()
+            .map(of_mask)
+            .collect::<Result<Vec<_>>>()?;
         let mut out = vec![Vec::new(); usize::from(masks.max())];
         for ((label, _), own) in present.iter().zip(logits) {
             out[usize::from(*label) - 1] = own;

@@ -6,7 +6,8 @@ use crate::conse::{Conse, DENSE, DenseMap};
 use crate::edges::Hed;
 use crate::regions::{Hierarchy, Node, watershed};
 use fastlgs_core::color::lab;
-use fastlgs_core::{LabelMap, Level, MaskList, image_io};
+use fastlgs_core::mask_list::{Mask, RunLengths};
+use fastlgs_core::{Level, MaskList, image_io};
 use image::RgbImage;
 
 /// Version of [`OfflineSegmenter`]. Increase it whenever the same photo gets other masks.
@@ -146,6 +147,7 @@ impl Segmenter for OfflineSegmenter {
         let [whole, part] = [WHOLE_HEIGHTS, PART_HEIGHTS]
             .map(|[low, high]| tree.is_below(&tree.best_cut(|i| persistence(&tree, i, low, high))));
         let mut list = MaskList::new(photo.width(), photo.height());
+        let runs = basin_runs(&basins, small.dimensions(), photo.dimensions());
         let is_candidate = |node: usize| {
             let share = tree.nodes[node].area / (w * h) as f32;
             let is_distinct = tree.span(node) >= DISTINCT_SPAN;
@@ -153,10 +155,11 @@ impl Segmenter for OfflineSegmenter {
         };
         for node in tree.stable_nodes(is_candidate, MAX_OVERLAP) {
             let level = Level::ALL[usize::from(whole[node]) + usize::from(part[node])];
-            list.add(
-                level,
-                &region(&tree, node, &basins, w, h).resized(photo.width(), photo.height()),
-            );
+            let mask = region(&tree, node, &runs);
+            // A region that is smaller than a pixel of the photo disappears.
+            if mask.area() > 0 {
+                list.masks.push(Mask::new(level, mask));
+            }
         }
         Ok(list)
     }
@@ -192,19 +195,63 @@ fn persistence(tree: &Hierarchy, i: usize, low: f32, high: f32) -> f32 {
     node.area * (end.clamp(low, high) - node.height.clamp(low, high))
 }
 
-/// Returns the pixels of a region as label 1.
-fn region(tree: &Hierarchy, node: usize, basins: &[u32], w: usize, h: usize) -> LabelMap {
+/// Runs of pixels of one basin, down the columns of a photo: basin and number of pixels.
+type BasinRuns = Vec<(u32, u32)>;
+
+/// Returns the runs of a photo of the size `to`, whose basins are those of the nearest pixels of an
+/// image of the size `from`.
+fn basin_runs(basins: &[u32], from: (u32, u32), to: (u32, u32)) -> BasinRuns {
+    let nearest = |n: u32, from: u32, to: u32| (2 * n + 1) * from / (2 * to);
+    let rows: Vec<u32> = (0..to.1).map(|y| nearest(y, from.1, to.1)).collect();
+    let mut runs = BasinRuns::new();
+    for x in 0..to.0 {
+        let column = nearest(x, from.0, to.0);
+        for row in &rows {
+            let basin = basins[(row * from.0 + column) as usize];
+            match runs.last_mut() {
+                Some((last, count)) if *last == basin => *count += 1,
+                _ => runs.push((basin, 1)),
+            }
+        }
+    }
+    runs
+}
+
+/// Returns the pixels of a region.
+fn region(tree: &Hierarchy, node: usize, runs: &BasinRuns) -> RunLengths {
     let mut is_its = vec![false; tree.nodes.len()];
     tree.leaves(node)
         .into_iter()
         .for_each(|leaf| is_its[leaf] = true);
-    let labels = basins
-        .iter()
-        .map(|b| u16::from(is_its[*b as usize]))
-        .collect();
-    LabelMap {
-        width: w as u32,
-        height: h as u32,
-        labels,
+    RunLengths::from_runs(runs.iter().map(|&(basin, n)| (is_its[basin as usize], n)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use fastlgs_core::LabelMap;
+
+    #[test]
+    fn runs_show_the_nearest_basins() {
+        let basins: Vec<u32> = (0..12).map(|p| p / 2).collect();
+        let map = LabelMap {
+            width: 4,
+            height: 3,
+            labels: basins.iter().map(|b| *b as u16).collect(),
+        };
+        for to in [(4, 3), (7, 5), (2, 3), (1, 1)] {
+            let nearest = map.resized(to.0, to.1);
+            let runs = basin_runs(&basins, (4, 3), to);
+            assert!(runs.windows(2).all(|pair| pair[0].0 != pair[1].0));
+            let found: Vec<u16> = runs
+                .iter()
+                .flat_map(|&(basin, n)| std::iter::repeat_n(basin as u16, n as usize))
+                .collect();
+            let down_the_columns: Vec<u16> = (0..to.0)
+                .flat_map(|x| (0..to.1).map(move |y| (x, y)))
+                .map(|(x, y)| nearest.at(x, y))
+                .collect();
+            assert_eq!(found, down_the_columns, "{to:?}");
+        }
     }
 }

@@ -87,8 +87,6 @@ impl MaskList {
         }
     }
 
-    /// Creates the list of the masks in three label maps of one size, one for each level, coarse to
-    /// fine.
     /// Appends the masks of a label map in ascending order of their labels. Returns these labels.
     pub fn add(&mut self, level: Level, map: &LabelMap) -> Vec<u16> {
         let boxes = map.boxes();

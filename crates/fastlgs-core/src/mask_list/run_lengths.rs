@@ -15,13 +15,20 @@ const ASCII_OFFSET: u8 = 48;
 impl RunLengths {
     /// Creates the run lengths of the pixels (x, y) for which `member` returns true.
     pub fn from_fn(width: u32, height: u32, member: impl Fn(u32, u32) -> bool) -> Self {
+        let column = |x: u32| (0..height).map(move |y| (x, y));
+        Self::from_runs((0..width).flat_map(column).map(|(x, y)| (member(x, y), 1)))
+    }
+
+    /// Creates the run lengths of consecutive runs of pixels, column by column: whether they are
+    /// inside, and their number. Neighbouring runs may both be inside or outside.
+    pub fn from_runs(parts: impl Iterator<Item = (bool, u32)>) -> Self {
         let (mut runs, mut inside, mut length) = (Vec::new(), false, 0);
-        for (x, y) in (0..width).flat_map(|x| (0..height).map(move |y| (x, y))) {
-            if member(x, y) != inside {
+        for (is_member, count) in parts {
+            if is_member != inside {
                 runs.push(std::mem::take(&mut length));
                 inside = !inside;
             }
-            length += 1;
+            length += count;
         }
         runs.push(length);
         Self(runs)
