@@ -26,9 +26,7 @@ use std::time::Duration;
 /// COLMAP's camera model, with one radial distortion term. All photos of one size share a camera.
 const CAMERA_MODEL: &str = "SIMPLE_RADIAL";
 /// Largest number of photos for which all pairs are matched.
-const EXHAUSTIVE: usize = 60;
-/// The same for the program `colmap`, which matches more photos by the order of their names.
-const EXHAUSTIVE_BY_COLMAP: usize = 120;
+const EXHAUSTIVE: usize = 120;
 /// With more photos, each is matched with this many that are most similar.
 const SIMILAR: usize = 20;
 /// In addition, all pairs of this many evenly spread photos are matched. In a video, the most
@@ -171,7 +169,7 @@ fn by_program(
     files: &[PathBuf],
     progress: &impl Fn(&str, &str) -> bool,
 ) -> Result<()> {
-    let matcher = if files.len() <= EXHAUSTIVE_BY_COLMAP {
+    let matcher = if files.len() <= EXHAUSTIVE {
         "exhaustive_matcher"
     } else {
         "sequential_matcher"
