@@ -218,8 +218,8 @@ impl TrainerConfig {
     /// views disagree.
     ///
     /// n steps of length r in random directions go about r sqrt(n) far. So scaled rates are
-    /// proportional to 1 / sqrt(iterations), and a short run goes as far as one of 3DGS. The rate of opacity is not scaled: with a larger one, the
-    /// price on opacity removes faint walls.
+    /// proportional to 1 / sqrt(iterations), and a short run goes as far as one of 3DGS. The rate of
+    /// opacity is not scaled: with a larger one, the price on opacity removes faint walls.
     pub(crate) fn rates(&self, iteration: u32, extent: f32) -> Rates {
         let mut rates = [0.0; BASE_CHANNELS + 1];
         let decay = 0.01f32.powf(self.progress(iteration));

@@ -2,8 +2,7 @@
 //!
 //! It minimises the reprojection error of the key points. Levenberg-Marquardt solves for the
 //! cameras; the Schur complement eliminates the points. Its blocks are sparse, and conjugate
-//! gradients solve it (Agarwal et al. 2010). Cauchy's loss reduces the weight of wrong
-//! matches.
+//! gradients solve it (Agarwal et al. 2010). Cauchy's loss reduces the weight of wrong matches.
 
 mod problem;
 

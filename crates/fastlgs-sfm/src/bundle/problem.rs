@@ -364,7 +364,8 @@ impl Problem<'_> {
         SVector::from(self.columns(view).map(|k| all[k]))
     }
 
-    /// Returns the diagonal of the matrix.
+    /// Returns the diagonal of the matrix. That of a lens is approximate: it lacks the blocks of two
+    /// cameras with the same lens. Damping and preconditioner need no more.
     fn diagonal(&self, reduced: &Reduced) -> DVector<f64> {
         let mut diagonal = reduced.added.clone();
         for ((a, b), block) in &reduced.blocks {
@@ -432,9 +433,12 @@ impl Problem<'_> {
         // Parameters without enough data stay fixed: cameras with few observations, lenses that
         // are not adjusted.
         let moves: Vec<bool> = (0..self.width(values))
-            .map(|k| match k < lenses_at {
-                true => counts[k / POSE_PARAMETERS] >= MIN_OBSERVATIONS,
-                false => (k - lenses_at) / 2 < values.lenses.len(),
+            .map(|k| {
+                if k < lenses_at {
+                    counts[k / POSE_PARAMETERS] >= MIN_OBSERVATIONS
+                } else {
+                    (k - lenses_at) / 2 < values.lenses.len()
+                }
             })
             .collect();
         for _ in 0..BUNDLE_STEPS {
