@@ -42,21 +42,15 @@ impl Evidence {
 pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     // The law of absent names depends on the number of objects that are compared.
     let compared = grid.objects.iter().filter(|object| is_seen(object)).count();
-    match &query.source {
+    let by_cosines = |object: &Object, prior: f32| by_cosines(object, prior, query, compared);
+    match query.source_in(grid) {
         _ if query.rule == Rule::Paper => of_objects(grid, |object, _| by_relevancy(object, query)),
-        Source::Detector(classes) if grid.has_detections() => {
-            of_objects(grid, |object, _| by_votes(object, query, classes))
-        }
-        Source::Unknown if !query.is_known(grid) => {
-            let unknown = |object: &Object, prior: f32| Evidence {
-                score: 0.0,
-                ..by_cosines(object, prior, query, compared)
-            };
-            of_objects(grid, unknown)
-        }
-        _ => of_objects(grid, |object, prior| {
-            by_cosines(object, prior, query, compared)
+        Source::Detector(classes) => of_objects(grid, |object, _| by_votes(object, query, classes)),
+        Source::Unknown => of_objects(grid, |object, prior| Evidence {
+            score: 0.0,
+            ..by_cosines(object, prior)
         }),
+        Source::Embeddings => of_objects(grid, by_cosines),
     }
 }
 

@@ -3,7 +3,7 @@
 use crate::calibration::Best;
 use crate::evidence::{Evidence, evidence, margin};
 use crate::grid::{Grid, Object};
-use crate::relevancy::{Rule, TextQuery};
+use crate::relevancy::{Rule, Source, TextQuery};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
@@ -144,8 +144,8 @@ pub fn best_score(ranked: &[Hit]) -> f32 {
 
 /// Returns the targets; empty means "not found".
 ///
-/// The first target is the object with the highest rank, if it is found. Others are added if they
-/// do not overlap a target. Their rank and calibrated margin may be lower than the first one's by at
+/// The first target is the object with the highest rank, if it is found, or a whole that contains
+/// it; see [`whole_of`]. Others are added if they do not overlap a target. Their rank and calibrated margin may be lower than the first one's by at
 /// most the combined standard error.
 ///
 /// The calibrated margin must agree as well. Size alone may make a large object the first target,
@@ -160,6 +160,7 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
         return Vec::new();
     };
     let found = ranked.iter().skip(1).filter(found);
+    let best = whole_of(best, grid, ranked, query, &evidence);
     let first = of(best);
     let mut chosen = vec![*best];
     let mut taken = grid.related(best.id);
@@ -178,6 +179,35 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
         }
     }
     chosen
+}
+
+/// Returns the largest object that contains `best` and has the same rank within the combined
+/// standard error; `best` itself if there is none.
+///
+/// A crop of a part looks like a crop of the whole. Their cosines differ by less than those of the
+/// views, so cosines do not tell one from the other. The boxes of the detector do.
+fn whole_of<'a>(
+    best: &'a Hit,
+    grid: &Grid,
+    ranked: &'a [Hit],
+    query: &TextQuery,
+    evidence: &[Evidence],
+) -> &'a Hit {
+    if query.rule == Rule::Paper || *query.source_in(grid) != Source::Embeddings {
+        return best;
+    }
+    let place = |hit: &Hit| usize::from(hit.id) - 1;
+    let (shares, first) = (grid.shares(), evidence[place(best)]);
+    let is_whole = |hit: &&Hit| {
+        let own = evidence[place(hit)];
+        first.rank - own.rank <= own.error.hypot(first.error)
+            && (shares[place(best)]..0.5).contains(&shares[place(hit)])
+            && grid.parts(&[hit.id])[place(best)]
+    };
+    let wholes = ranked.iter().filter(is_whole);
+    wholes
+        .max_by(|a, b| shares[place(a)].total_cmp(&shares[place(b)]))
+        .unwrap_or(best)
 }
 
 /// Returns the part of the `targets` that answers the query, among all objects in them; `None` if
@@ -507,6 +537,44 @@ pub(crate) mod tests {
             Some(3)
         );
         assert_eq!(meant(&[vec![3, 1], vec![3, 1], vec![2, 1]]), Some(1));
+    }
+
+    #[test]
+    fn a_whole_is_preferred_to_a_part_that_differs_by_less_than_the_views() {
+        // Object 2 is a part of 1 and has a higher cosine. Object 3 is the rest.
+        let target = |whole: [f32; 2], source: Source| {
+            let seen = |id, parent, vote, cosines: [f32; 2]| Object {
+                detected: Some([("cat".to_owned(), vote)].into()),
+                ..object_with_cosines(id, parent, 0.1, cosines.map(|c| [c, 0.0]).to_vec())
+            };
+            let grid = Grid {
+                objects: vec![
+                    seen(1, 0, 0.39, whole),
+                    seen(2, 1, 0.4, [0.9, 0.9]),
+                    seen(3, 0, 0.1, [0.1, 0.1]),
+                ],
+                id_areas: vec![0.0, 0.2, 0.1, 0.7],
+                ..Grid::default()
+            };
+            let query = TextQuery {
+                source,
+                ..query([1.0, 0.0])
+            };
+            ids(&select(
+                &grid,
+                &rank(&grid, &query),
+                &query,
+                &QueryConfig::default(),
+            ))[0]
+        };
+        assert_eq!(target([0.95, 0.65], Source::Embeddings), 1);
+        assert_eq!(target([0.81, 0.79], Source::Embeddings), 2, "clearly less");
+        let detector = Source::Detector(vec!["cat".to_owned()]);
+        assert_eq!(
+            target([0.95, 0.65], detector),
+            2,
+            "votes of the detector tell the level"
+        );
     }
 
     #[test]

@@ -92,9 +92,18 @@ impl TextQuery {
         }
     }
 
+    /// Returns the source of evidence in this scene: embeddings if it has no votes of the detector.
+    pub fn source_in(&self, grid: &Grid) -> &Source {
+        if grid.has_detections() {
+            &self.source
+        } else {
+            &Source::Embeddings
+        }
+    }
+
     /// Returns whether a source of evidence knows the name in this scene.
     pub fn is_known(&self, grid: &Grid) -> bool {
-        self.source != Source::Unknown || !grid.has_detections()
+        *self.source_in(grid) != Source::Unknown
     }
 
     /// Returns the relevancy S = min_i exp(t phi.q) / (exp(t phi.c_i) + exp(t phi.q)), 0 to 1. At

@@ -219,7 +219,9 @@ impl TrainerConfig {
     ///
     /// n steps of length r in random directions go about r sqrt(n) far. So scaled rates are
     /// proportional to 1 / sqrt(iterations), and a short run goes as far as one of 3DGS. The rate of
-    /// opacity is not scaled: with a larger one, the price on opacity removes faint walls.
+    /// opacity is not scaled: with a larger one, the price on opacity removes faint walls. Those of
+    /// scale and rotation are scaled by the root of the factor: with larger ones, Gaussians grow
+    /// across the borders of objects.
     pub(crate) fn rates(&self, iteration: u32, extent: f32) -> Rates {
         let mut rates = [0.0; BASE_CHANNELS + 1];
         let decay = 0.01f32.powf(self.progress(iteration));
@@ -229,8 +231,8 @@ impl TrainerConfig {
             (1.0, 1.0)
         };
         rates[channel::MEAN].fill(1.6e-4 * extent * factor * decay);
-        rates[channel::LOG_SCALE].fill(5e-3 * factor * late_decay);
-        rates[channel::ROTATION].fill(1e-3 * factor * late_decay);
+        rates[channel::LOG_SCALE].fill(5e-3 * factor.sqrt() * late_decay);
+        rates[channel::ROTATION].fill(1e-3 * factor.sqrt() * late_decay);
         rates[channel::OPACITY] = 5e-2 * late_decay;
         rates[channel::COLOR].fill(5e-3 * factor * late_decay);
         rates[channel::FEATURE].fill(1e-2 * decay);
@@ -440,6 +442,8 @@ mod tests {
         // sqrt(30,000 / 8,000) times the rates of 3DGS.
         let factor = 3.75f32.sqrt();
         assert!((first[0] - factor * 3.2e-4).abs() < 1e-8);
+        let scale = channel::LOG_SCALE.start;
+        assert!((first[scale] - factor.sqrt() * 5e-3).abs() < 1e-8);
         assert!((last[0] - first[0] / 100.0).abs() < 1e-8);
         let colour = channel::COLOR.start;
         assert!((middle[colour] - factor * 5e-3).abs() < 1e-8);

@@ -13,7 +13,7 @@ use std::path::PathBuf;
 #[serde(rename_all = "kebab-case")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Preset {
-    /// 1,500 iterations.
+    /// 1,800 iterations.
     Quick,
     /// 7,000 iterations.
     #[default]
@@ -31,7 +31,7 @@ impl Preset {
     /// budget.
     pub(super) fn values(self) -> (u32, u32, usize) {
         match self {
-            Self::Quick => (1_500, 2, 200_000),
+            Self::Quick => (1_800, 2, 200_000),
             Self::Standard => (7_000, 2, 300_000),
             Self::Paper | Self::LikePaper => (30_000, 3, 1_000_000),
         }
