@@ -181,8 +181,8 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
     chosen
 }
 
-/// Returns the largest object that contains `best` and has the same rank within the combined
-/// standard error; `best` itself if there is none.
+/// Returns the largest object that contains `best` and whose rank is not lower by more than twice
+/// the combined standard error; `best` itself if there is none.
 ///
 /// A crop of a part looks like a crop of the whole. Their cosines differ by less than those of the
 /// views, so cosines do not tell one from the other. The boxes of the detector do.
@@ -200,7 +200,7 @@ fn whole_of<'a>(
     let (shares, first) = (grid.shares(), evidence[place(best)]);
     let is_whole = |hit: &&Hit| {
         let own = evidence[place(hit)];
-        first.rank - own.rank <= own.error.hypot(first.error)
+        first.rank - own.rank <= 2.0 * own.error.hypot(first.error)
             && (shares[place(best)]..0.5).contains(&shares[place(hit)])
             && grid.parts(&[hit.id])[place(best)]
     };
