@@ -2,22 +2,18 @@
 //!
 //! Each bench writes its files into a folder and returns its figures as JSON.
 
+mod all;
 mod autoencoder;
 mod baseline;
-mod chart;
 mod clip;
 mod command;
 mod disturb;
 mod labelled;
 mod names;
-mod paper;
 mod plot;
-mod size;
 mod speed;
-mod stability;
 mod table;
 mod trial;
-mod ways;
 
 use anyhow::Result;
 use clap::Parser;
@@ -46,14 +42,8 @@ enum Bench {
     Speed(speed::Args),
     /// Evaluate another kind of language field on the same Gaussians and masks.
     Baseline(baseline::Args),
-    /// Plot accuracy against time for several methods of making a language field.
-    Chart(chart::Args),
-    /// Measure accuracy and PSNR of smaller models, and check `--budget auto`.
-    Size(size::Args),
-    /// Measure how accuracy changes when the input is disturbed, and on difficult generated scenes.
-    Stability(stability::Args),
-    /// Repeat the paper's ablations and list the paper's figures for comparison.
-    Paper(paper::Args),
+    /// Measure accuracy against time, stability and size, and make all pages of the results.
+    All(all::Args),
     /// Evaluate text queries with a calibration from other scenes, and from all scenes.
     Names(names::Args),
     /// Evaluate text queries on real CLIP embeddings of rooms, and measure their calibration.
@@ -73,10 +63,7 @@ fn bench(what: &Bench, run: &Run) -> Result<Value> {
     match what {
         Bench::Speed(args) => speed::run(args, run),
         Bench::Baseline(args) => baseline::run(args, run),
-        Bench::Chart(args) => chart::run(args, run),
-        Bench::Size(args) => size::run(args, run),
-        Bench::Stability(args) => stability::run(args, run),
-        Bench::Paper(args) => paper::run(args, run),
+        Bench::All(args) => all::run(args, run),
         Bench::Names(args) => names::run(args, run),
         Bench::Clip(args) => Ok(serde_json::to_value(clip::run(args)?)?),
     }

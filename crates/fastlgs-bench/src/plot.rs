@@ -5,11 +5,11 @@ use fastlgs_core::image_io;
 use image::RgbImage;
 use plotters::coord::Shift;
 use plotters::prelude::*;
-use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Once;
 
 /// Title of a chart and labels of its axes.
+#[derive(Clone, Copy)]
 pub struct Axes<'a> {
     pub title: &'a str,
     pub x: &'a str,
@@ -34,11 +34,7 @@ type Drawn = Result<(), Box<dyn std::error::Error>>;
 /// The font of all charts.
 const FONT: &str = "sans-serif";
 
-/// Writes `NAME.svg` and `NAME.png` into `folder`, atomically.
-///
-/// # Errors
-/// The drawing fails, or a file cannot be written.
-pub fn save(folder: &Path, name: &str, drawing: &impl Drawing) -> Result<()> {
+fn register_font() {
     static FONTS: Once = Once::new();
     FONTS.call_once(|| {
         // Fails only for a damaged font. This font is part of the program.
@@ -48,22 +44,36 @@ pub fn save(folder: &Path, name: &str, drawing: &impl Drawing) -> Result<()> {
             epaint_default_fonts::UBUNTU_LIGHT,
         );
     });
-    let (width, height) = drawing.size();
-    let path = folder.join(format!("{name}.svg"));
-    let cannot = |e: Box<dyn std::error::Error>| {
-        anyhow!("{}: drawing the chart failed: {e}", path.display())
-    };
+}
+
+/// Returns a drawing as SVG.
+///
+/// # Errors
+/// The drawing fails.
+pub fn svg(drawing: &impl Drawing) -> Result<String> {
+    register_font();
     let mut svg = String::new();
-    on_white(SVGBackend::with_string(&mut svg, (width, height)), drawing).map_err(cannot)?;
-    fastlgs_core::fs::write_atomic(&path, |file| {
+    on_white(SVGBackend::with_string(&mut svg, drawing.size()), drawing).map_err(failed)?;
+    Ok(svg)
+}
+
+fn failed(error: Box<dyn std::error::Error>) -> anyhow::Error {
+    anyhow!("drawing a chart failed: {error}")
+}
+
+/// Writes `NAME.svg` and `NAME.png` into `folder`, atomically.
+///
+/// # Errors
+/// The drawing fails, or a file cannot be written.
+pub fn save(folder: &Path, name: &str, drawing: &impl Drawing) -> Result<()> {
+    let (width, height) = drawing.size();
+    let svg = svg(drawing)?;
+    fastlgs_core::fs::write_atomic(&folder.join(format!("{name}.svg")), |file| {
         std::io::Write::write_all(file, svg.as_bytes())
     })?;
     let mut pixels = vec![0; (3 * width * height) as usize];
-    on_white(
-        BitMapBackend::with_buffer(&mut pixels, (width, height)),
-        drawing,
-    )
-    .map_err(cannot)?;
+    let canvas = BitMapBackend::with_buffer(&mut pixels, (width, height));
+    on_white(canvas, drawing).map_err(failed)?;
     let picture = RgbImage::from_raw(width, height, pixels).context("a chart's pixels")?;
     Ok(image_io::save_png(
         &folder.join(format!("{name}.png")),
@@ -169,80 +179,128 @@ impl Drawing for Lines<'_> {
 /// A point of a scatter chart.
 #[derive(Clone)]
 pub struct Point {
-    /// Points of one series share a colour.
-    pub series: String,
     pub name: String,
     pub x: f64,
     pub y: f64,
+    /// Lowest and highest y, drawn as a bar.
+    pub range: (f64, f64),
     /// Whether the point is on the Pareto front. Such points are filled and joined by a line.
     pub front: bool,
 }
 
-/// A scatter chart with names and a logarithmic x axis.
-pub struct Scatter<'a> {
-    pub axes: Axes<'a>,
-    pub spots: &'a [Point],
+/// One of several scatter charts with the same axes.
+pub struct Panel {
+    pub name: String,
+    pub points: Vec<Point>,
 }
 
-impl Drawing for Scatter<'_> {
+/// Scatter charts beside each other, with logarithmic x axes and the names of their points.
+pub struct Panels<'a> {
+    pub axes: Axes<'a>,
+    pub panels: Vec<Panel>,
+}
+
+impl Panels<'_> {
+    const COLUMNS: usize = 2;
+    const PANEL: (u32, u32) = (560, 400);
+    const TITLE: u32 = 40;
+
+    fn draw_panel<DB: DrawingBackend>(
+        &self,
+        area: &DrawingArea<DB, Shift>,
+        panel: &Panel,
+        color: RGBAColor,
+    ) -> Drawn
+    where
+        DB::ErrorType: 'static,
+    {
+        let points = || panel.points.iter().filter(|p| p.x > 0.0 && p.y.is_finite());
+        let span = |values: &mut dyn Iterator<Item = f64>| {
+            let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| {
+                (l.min(v), h.max(v))
+            });
+            if low.is_finite() {
+                (low, high)
+            } else {
+                (1.0, 2.0)
+            }
+        };
+        let (left, right) = span(&mut points().map(|p| p.x));
+        let (low, high) = span(&mut points().flat_map(|p| [p.range.0, p.range.1]));
+        let margin = 0.1 * (high - low).max(0.02);
+        // The names need room to the right of their points.
+        let x = (left / 1.2..right * (right / left).powf(0.6).max(1.6)).log_scale();
+        let axes = Axes {
+            title: &panel.name,
+            ..self.axes
+        };
+        let mut chart = titled(area, &axes).build_cartesian_2d(x, low - margin..high + margin)?;
+        chart
+            .configure_mesh()
+            .x_desc(axes.x)
+            .y_desc(axes.y)
+            .x_labels(6)
+            .y_labels(6)
+            .x_label_formatter(&|x| x.to_string())
+            .draw()?;
+        let mut front: Vec<(f64, f64)> = points().filter(|p| p.front).map(|p| (p.x, p.y)).collect();
+        front.sort_by(|a, b| a.0.total_cmp(&b.0));
+        chart.draw_series(LineSeries::new(front, color.stroke_width(1)))?;
+        chart.draw_series(points().map(|p| {
+            let ends = vec![(p.x, p.range.0), (p.x, p.range.1)];
+            PathElement::new(ends, BLACK.mix(0.4).stroke_width(1))
+        }))?;
+        let mut sorted: Vec<&Point> = points().collect();
+        sorted.sort_by(|a, b| b.y.total_cmp(&a.y).then(a.x.total_cmp(&b.x)));
+        // Names keep a distance of a line from names above them that are near.
+        let mut names: Vec<(i32, i32)> = Vec::new();
+        let mut places = Vec::new();
+        for point in &sorted {
+            let (x, mut y) = chart.backend_coord(&(point.x, point.y));
+            let own = y;
+            while names
+                .iter()
+                .any(|(other, line)| (x - other).abs() < 150 && (y - line).abs() < 11)
+            {
+                y += 1;
+            }
+            names.push((x, y));
+            places.push(y - own);
+        }
+        chart.draw_series(sorted.iter().zip(places).map(|(p, shift)| {
+            let style = if p.front {
+                color.filled()
+            } else {
+                color.stroke_width(1)
+            };
+            EmptyElement::at((p.x, p.y))
+                + Circle::new((0, 0), 4, style)
+                + Text::new(p.name.clone(), (7, shift - 6), (FONT, 11))
+        }))?;
+        Ok(())
+    }
+}
+
+impl Drawing for Panels<'_> {
+    fn size(&self) -> (u32, u32) {
+        let rows = self.panels.len().max(1).div_ceil(Self::COLUMNS) as u32;
+        (
+            Self::COLUMNS as u32 * Self::PANEL.0,
+            Self::TITLE + rows * Self::PANEL.1,
+        )
+    }
+
     fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>) -> Drawn
     where
         DB::ErrorType: 'static,
     {
-        let spots = || self.spots.iter().filter(|s| s.x > 0.0 && s.y.is_finite());
-        let span = |of: fn(&Point) -> f64| {
-            spots()
-                .map(of)
-                .fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| {
-                    (l.min(v), h.max(v))
-                })
-        };
-        let ((left, right), (low, high)) = (span(|s| s.x), span(|s| s.y));
-        let (x, y) = if left.is_finite() {
-            // Values between 0 and 1 get the full range. The names need room to the right of their
-            // points.
-            let y = if low >= 0.0 && high <= 1.0 {
-                0.0..1.0
-            } else {
-                low - 0.1 * (high - low + 1.0)..high + 0.1 * (high - low + 1.0)
-            };
-            (left / 1.5..right * 2.5, y)
-        } else {
-            (1.0..10.0, 0.0..1.0)
-        };
-        let mut chart = titled(area, &self.axes).build_cartesian_2d(x.log_scale(), y)?;
-        chart
-            .configure_mesh()
-            .x_desc(self.axes.x)
-            .y_desc(self.axes.y)
-            .draw()?;
-        let series: BTreeSet<&String> = spots().map(|s| &s.series).collect();
-        for (k, name) in series.into_iter().enumerate() {
-            let color = Palette99::pick(k).to_rgba();
-            let own: Vec<&Point> = spots().filter(|s| s.series == *name).collect();
-            let mut front: Vec<(f64, f64)> =
-                own.iter().filter(|s| s.front).map(|s| (s.x, s.y)).collect();
-            front.sort_by(|a, b| a.0.total_cmp(&b.0));
-            let line = chart
-                .draw_series(LineSeries::new(front, color.stroke_width(1)))?
-                .label(name);
-            line.legend(move |(x, y)| {
-                PathElement::new([(x, y), (x + 18, y)], color.stroke_width(2))
-            });
-            chart.draw_series(own.iter().enumerate().map(|(k, s)| {
-                let style = if s.front {
-                    color.filled()
-                } else {
-                    color.stroke_width(1)
-                };
-                // Shifts neighbouring names vertically, so that they do not overlap.
-                let beside = (7, 12 * (k as i32 % 3) - 18);
-                EmptyElement::at((s.x, s.y))
-                    + Circle::new((0, 0), 4, style)
-                    + Text::new(s.name.clone(), beside, (FONT, 12))
-            }))?;
+        let (title, rest) = area.split_vertically(Self::TITLE);
+        title.draw(&Text::new(self.axes.title.to_owned(), (16, 12), (FONT, 20)))?;
+        let rows = self.panels.len().max(1).div_ceil(Self::COLUMNS);
+        let places = rest.split_evenly((rows, Self::COLUMNS));
+        for (k, (panel, place)) in self.panels.iter().zip(&places).enumerate() {
+            self.draw_panel(place, panel, Palette99::pick(k).to_rgba())?;
         }
-        legend!(chart);
         Ok(())
     }
 }
@@ -265,7 +323,7 @@ pub struct HeatMap<'a> {
 
 impl HeatMap<'_> {
     const ROW: i32 = 20;
-    const NAME: i32 = 250;
+    const NAME: i32 = 290;
     const COLUMN: i32 = 92;
     const HEAD: i32 = 64;
 }
@@ -328,35 +386,32 @@ mod tests {
     #[test]
     fn charts_are_written_in_both_forms() {
         let folder = tempfile::tempdir().expect("a folder");
-        let spot = |x, y| Point {
-            series: "s".to_owned(),
+        let point = |x, y: f64| Point {
             name: "spot".to_owned(),
             x,
             y,
+            range: (y, y),
             front: true,
         };
-        let axes = || Axes {
+        let axes = Axes {
             title: "title",
             x: "x",
             y: "y",
         };
-        save(
-            folder.path(),
-            "spots",
-            &Scatter {
-                axes: axes(),
-                spots: &[spot(1.0, 0.5), spot(10.0, f64::NAN)],
-            },
-        )
-        .expect("drawn");
-        save(
-            folder.path(),
-            "none",
-            &Scatter {
-                axes: axes(),
-                spots: &[],
-            },
-        )
+        let panel = |points| Panel {
+            name: "panel".to_owned(),
+            points,
+        };
+        let panels = vec![
+            panel(vec![point(1.0, 0.5), point(10.0, f64::NAN)]),
+            panel(Vec::new()),
+        ];
+        let drawn = svg(&Panels { axes, panels }).expect("drawn");
+        assert!(drawn.contains("spot") && drawn.contains("panel") && drawn.contains("title"));
+        svg(&Panels {
+            axes,
+            panels: Vec::new(),
+        })
         .expect("drawn");
         let rows = [(
             "row".to_owned(),

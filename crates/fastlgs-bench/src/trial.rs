@@ -12,65 +12,6 @@ pub fn text(path: &Path) -> &str {
     path.to_str().unwrap_or_default()
 }
 
-/// Creates an empty folder for trials below `output`. Leftovers of a killed run are removed.
-///
-/// # Errors
-/// The folder cannot be created.
-pub fn trials_folder(output: &Path) -> Result<PathBuf> {
-    let work = output.join(".trials");
-    let _ = std::fs::remove_dir_all(&work);
-    std::fs::create_dir_all(&work).with_context(|| work.display().to_string())?;
-    Ok(work.canonicalize()?)
-}
-
-/// Number of views and image size of the scenes that quick suites generate.
-pub const QUICK: (usize, &str) = (32, "240x180");
-
-/// Generates a scene and preprocesses it with its exact masks, unless it exists. Returns the scene
-/// folder.
-pub fn generated(run: &Run, work: &Path, kind: &str, views: usize, size: &str) -> Result<PathBuf> {
-    let (photos, scene) = (work.join(kind).join("photos"), work.join(kind).join(kind));
-    if !scene.is_dir() {
-        run_command(
-            run,
-            run.seed,
-            "synth",
-            &[
-                kind,
-                "-o",
-                text(&photos),
-                "--size",
-                size,
-                "--views",
-                &views.to_string(),
-            ],
-        )?;
-        run_command(
-            run,
-            run.seed,
-            "preprocess",
-            &[text(&photos), "-o", text(&scene), "--segmenter", "import"],
-        )?;
-    }
-    Ok(scene)
-}
-
-/// Returns the given scenes. Without any, generates and trains a table.
-pub fn or_generated(scenes: &[PathBuf], work: &Path, run: &Run) -> Result<Vec<PathBuf>> {
-    if !scenes.is_empty() {
-        return Ok(scenes.to_vec());
-    }
-    let (views, size) = QUICK;
-    let scene = generated(run, work, "table", views, size)?;
-    run_command(
-        run,
-        run.seed,
-        "train",
-        &[text(&scene), "--iterations", "1000"],
-    )?;
-    Ok(vec![scene])
-}
-
 /// Returns the last component of a path.
 pub fn name(path: &Path) -> String {
     path.file_name()
@@ -154,11 +95,6 @@ impl<'a> Trial<'a> {
             "eval",
             &[text(scene), "--labels", text(&self.labels)],
         )
-    }
-
-    /// Trains with `args`, evaluates, and returns both reports.
-    pub fn train_and_eval(&self, args: &[&str]) -> Result<[Value; 2]> {
-        Ok([self.train(args, self.run.seed)?, self.eval(&[])?])
     }
 }
 

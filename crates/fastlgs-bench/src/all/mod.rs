@@ -1,0 +1,252 @@
+//! `fastlgs-bench all`: makes all tables and figures of the results from one version.
+//!
+//! Measured rows are kept in `rows.json`, so that an interrupted run continues with the next row.
+//! All pages are made from these rows alone.
+
+mod measure;
+mod pages;
+mod plan;
+
+use anyhow::{Context, Result, bail};
+use fastlgs::Run;
+use fastlgs_core::fs;
+use fastlgs_synth::Kind;
+use measure::Measure;
+use plan::{SceneSource, WAYS};
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+#[derive(clap::Args)]
+#[command(
+    after_help = "Example: fastlgs-bench all --scenes ../data/fox,../data/office,table -o docs/results --device cpu"
+)]
+pub struct Args {
+    /// Folders of photos with labels/ beside them, and kinds of generated scenes, separated by
+    /// commas.
+    #[arg(long, value_delimiter = ',', default_value = "table")]
+    scenes: Vec<String>,
+    /// Ways to measure, by their names in the tables, separated by commas. Default: all. `none`
+    /// only writes the pages again.
+    #[arg(long, value_delimiter = ',', value_name = "NAMES")]
+    ways: Vec<String>,
+    /// Number of seeds.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..))]
+    seeds: u64,
+    /// Begin no further row after this time. The next run continues.
+    #[arg(long)]
+    minutes: Option<u64>,
+    /// Iterations of all trainings, and small generated photos: for tests.
+    #[arg(long, hide = true)]
+    iterations: Option<u32>,
+    /// Folder of base scenes, which later rows and runs reuse. Default: OUTPUT/.scenes.
+    #[arg(long)]
+    work: Option<PathBuf>,
+    /// README whose table of figures is replaced, between its markers.
+    #[arg(long)]
+    readme: Option<PathBuf>,
+    /// Folder of rows.json and of all pages and charts.
+    #[arg(short, long)]
+    output: PathBuf,
+}
+
+/// Version of the measured code: the last commit that changed anything but the bench.
+const VERSION: &str = concat!(
+    env!("CARGO_PKG_VERSION"),
+    ", commit ",
+    env!("FASTLGS_COMMIT")
+);
+
+/// All measured rows. They are of one version.
+#[derive(Serialize, Deserialize)]
+pub struct Rows {
+    pub version: String,
+    /// Each row has `scene`, `way`, `seed` and `machine`, and figures.
+    pub rows: Vec<Value>,
+}
+
+impl Rows {
+    /// Loads the rows of `file`; empty if it is missing.
+    ///
+    /// # Errors
+    /// The file is damaged. If rows are to be added, it has rows of another version.
+    fn load(file: &Path, to_add: bool) -> Result<Self> {
+        if !file.is_file() {
+            return Ok(Self {
+                version: VERSION.to_owned(),
+                rows: Vec::new(),
+            });
+        }
+        let rows: Self = fs::read_json(file)?;
+        if to_add && rows.version != VERSION {
+            bail!(
+                "{}: these rows are of version {}, and this is {VERSION}; remove the file to measure all rows again",
+                file.display(),
+                rows.version
+            );
+        }
+        Ok(rows)
+    }
+
+    fn has(&self, planned: &plan::Planned) -> bool {
+        self.rows.iter().any(|row| {
+            row["scene"] == planned.scene.name.as_str()
+                && row["way"] == planned.way.name
+                && row["seed"] == planned.seed
+        })
+    }
+}
+
+/// Returns the given scenes and the difficult ones.
+fn scenes(names: &[String]) -> Result<Vec<SceneSource>> {
+    let mut scenes: Vec<SceneSource> = names.iter().map(|name| SceneSource::of(name)).collect();
+    for scene in &scenes {
+        if scene.photos.is_none() && Kind::of(&scene.name).is_none() {
+            bail!(
+                "--scenes: '{}' is neither a folder of photos nor a kind of generated scene",
+                scene.name
+            );
+        }
+        let twice = scenes
+            .iter()
+            .filter(|other| other.name == scene.name)
+            .count()
+            > 1;
+        if twice {
+            bail!(
+                "--scenes: two scenes are called '{}'; rename a folder",
+                scene.name
+            );
+        }
+    }
+    scenes.extend(plan::difficult(&scenes));
+    Ok(scenes)
+}
+
+/// Runs the missing rows, and writes all pages.
+pub fn run(args: &Args, run: &Run) -> Result<Value> {
+    if let Some(unknown) = args
+        .ways
+        .iter()
+        .find(|name| *name != "none" && !WAYS.iter().any(|way| way.name == **name))
+    {
+        let known: Vec<&str> = WAYS.iter().map(|way| way.name).collect();
+        bail!(
+            "--ways: '{unknown}' is unknown; choose from {}",
+            known.join(", ")
+        );
+    }
+    let started = Instant::now();
+    let scenes = scenes(&args.scenes)?;
+    std::fs::create_dir_all(&args.output).with_context(|| args.output.display().to_string())?;
+    let file = args.output.join("rows.json");
+    let mut rows = Rows::load(&file, !args.ways.iter().any(|name| name == "none"))?;
+    let work = args
+        .work
+        .clone()
+        .unwrap_or_else(|| args.output.join(".scenes"));
+    std::fs::create_dir_all(&work).with_context(|| work.display().to_string())?;
+    let measure = Measure {
+        run,
+        work: &work.canonicalize()?,
+        iterations: args.iterations.map(|n| n.to_string()),
+    };
+    let mut missing = plan::rows(&scenes, args.seeds);
+    missing.retain(|row| {
+        (args.ways.is_empty() || args.ways.iter().any(|name| name == row.way.name))
+            && !rows.has(row)
+    });
+    let progress = run.work("rows", missing.len() as u64);
+    for planned in &missing {
+        let late = |minutes| started.elapsed() >= Duration::from_secs(60 * minutes);
+        if args.minutes.is_some_and(late) {
+            break;
+        }
+        let name = format!(
+            "{}, '{}', seed {}",
+            planned.scene.name, planned.way.name, planned.seed
+        );
+        let mut row = measure.row(planned).with_context(|| name.clone())?;
+        tracing::info!(%row, "{name}");
+        row["scene"] = json!(planned.scene.name);
+        row["way"] = json!(planned.way.name);
+        row["seed"] = json!(planned.seed);
+        row["machine"] = json!(measure::machine());
+        rows.rows.push(row);
+        fs::write_json(&file, &rows)?;
+        progress.advance()?;
+    }
+    for (name, text) in pages::all(&rows)? {
+        write(&args.output.join(name), &text)?;
+    }
+    if let Some(readme) = &args.readme {
+        let text = String::from_utf8_lossy(&fs::read(readme)?).into_owned();
+        write(
+            readme,
+            &pages::with_table(&text, &rows).with_context(|| readme.display().to_string())?,
+        )?;
+    }
+    let left = missing.iter().filter(|planned| !rows.has(planned)).count();
+    Ok(json!({ "rows": rows.rows.len(), "missing": left, "version": rows.version }))
+}
+
+fn write(path: &Path, text: &str) -> Result<()> {
+    Ok(fs::write_atomic(path, |file| {
+        std::io::Write::write_all(file, text.as_bytes())
+    })?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_of_another_version_are_refused() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let file = folder.path().join("rows.json");
+        let rows = Rows::load(&file, true).expect("no rows yet");
+        assert!(rows.rows.is_empty() && rows.version == VERSION);
+        let other = Rows {
+            version: "0.0.1, commit 1234567".to_owned(),
+            ..rows
+        };
+        fs::write_json(&file, &other).expect("written");
+        let message = Rows::load(&file, true).err().expect("refused").to_string();
+        assert!(Rows::load(&file, false).is_ok());
+        assert!(
+            message.contains("1234567") && message.contains("rows.json"),
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn unknown_and_equal_scenes_are_refused() {
+        let names =
+            |names: &[&str]| scenes(&names.iter().map(|n| (*n).to_owned()).collect::<Vec<_>>());
+        assert!(names(&["no-such-scene"]).is_err());
+        assert!(names(&["table", "table"]).is_err());
+        assert!(names(&["table", "twins"]).is_ok());
+    }
+
+    /// The committed pages are those of the committed rows, and so is the table in the README.
+    #[test]
+    fn published_pages_are_made_from_their_rows() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+        let folder = root.join("docs/results");
+        let rows: Rows = fs::read_json(&folder.join("rows.json")).expect("the published rows");
+        for (name, text) in pages::all(&rows).expect("pages") {
+            let published = std::fs::read_to_string(folder.join(&name)).unwrap_or_default();
+            assert!(
+                published == text,
+                "docs/results/{name} differs from its rows; run fastlgs-bench all --ways none --readme README.md -o docs/results"
+            );
+        }
+        let readme = std::fs::read_to_string(root.join("README.md")).expect("the README");
+        let expected = pages::with_table(&readme, &rows).expect("markers");
+        assert!(
+            readme == expected,
+            "README.md differs from docs/results/rows.json"
+        );
+    }
+}
