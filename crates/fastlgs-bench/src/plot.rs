@@ -194,6 +194,15 @@ pub struct Panel {
     pub points: Vec<Point>,
 }
 
+/// Smallest span of a y axis.
+const MIN_SPAN: f64 = 0.1;
+
+/// Formats a number with two significant digits, or more before the decimal point.
+fn two_digits(value: f64) -> String {
+    let decimals = (1.0 - value.abs().max(1e-9).log10().floor()).max(0.0) as usize;
+    format!("{value:.decimals$}")
+}
+
 /// Scatter charts beside each other, with logarithmic x axes and the names of their points.
 pub struct Panels<'a> {
     pub axes: Axes<'a>,
@@ -227,9 +236,11 @@ impl Panels<'_> {
         };
         let (left, right) = span(&mut points().map(|p| p.x));
         let (low, high) = span(&mut points().flat_map(|p| [p.range.0, p.range.1]));
-        let margin = 0.1 * (high - low).max(0.02);
+        // Differences that seeds make alone do not fill the chart.
+        let margin = 0.1 * (high - low) + 0.5 * (MIN_SPAN - (high - low)).max(0.0);
         // The names need room to the right of their points.
-        let x = (left / 1.2..right * (right / left).powf(0.6).max(1.6)).log_scale();
+        let (left, right) = (left.log10(), right.log10());
+        let x = left - 0.08..right + 0.2 + 0.5 * (right - left);
         let axes = Axes {
             title: &panel.name,
             ..self.axes
@@ -241,13 +252,16 @@ impl Panels<'_> {
             .y_desc(axes.y)
             .x_labels(6)
             .y_labels(6)
-            .x_label_formatter(&|x| x.to_string())
+            .x_label_formatter(&|exponent| two_digits(10f64.powf(*exponent)))
             .draw()?;
-        let mut front: Vec<(f64, f64)> = points().filter(|p| p.front).map(|p| (p.x, p.y)).collect();
+        let mut front: Vec<(f64, f64)> = points()
+            .filter(|p| p.front)
+            .map(|p| (p.x.log10(), p.y))
+            .collect();
         front.sort_by(|a, b| a.0.total_cmp(&b.0));
         chart.draw_series(LineSeries::new(front, color.stroke_width(1)))?;
         chart.draw_series(points().map(|p| {
-            let ends = vec![(p.x, p.range.0), (p.x, p.range.1)];
+            let ends = vec![(p.x.log10(), p.range.0), (p.x.log10(), p.range.1)];
             PathElement::new(ends, BLACK.mix(0.4).stroke_width(1))
         }))?;
         let mut sorted: Vec<&Point> = points().collect();
@@ -256,7 +270,7 @@ impl Panels<'_> {
         let mut names: Vec<(i32, i32)> = Vec::new();
         let mut places = Vec::new();
         for point in &sorted {
-            let (x, mut y) = chart.backend_coord(&(point.x, point.y));
+            let (x, mut y) = chart.backend_coord(&(point.x.log10(), point.y));
             let own = y;
             while names
                 .iter()
@@ -273,7 +287,7 @@ impl Panels<'_> {
             } else {
                 color.stroke_width(1)
             };
-            EmptyElement::at((p.x, p.y))
+            EmptyElement::at((p.x.log10(), p.y))
                 + Circle::new((0, 0), 4, style)
                 + Text::new(p.name.clone(), (7, shift - 6), (FONT, 11))
         }))?;
@@ -382,6 +396,12 @@ impl Drawing for HeatMap<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn labels_have_two_digits() {
+        let labels = [0.123, 1.26, 15.8, 126.0].map(two_digits);
+        assert_eq!(labels, ["0.12", "1.3", "16", "126"]);
+    }
 
     #[test]
     fn charts_are_written_in_both_forms() {
