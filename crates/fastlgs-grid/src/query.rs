@@ -145,7 +145,7 @@ pub fn best_score(ranked: &[Hit]) -> f32 {
 /// Returns the targets; empty means "not found".
 ///
 /// The first target is the object with the highest rank, if it is found, or a whole that contains
-/// it; see [`whole_of`]. Others are added if they do not overlap a target. Their rank and calibrated margin may be lower than the first one's by at
+/// it. Others are added if they do not overlap a target. Their rank and calibrated margin may be lower than the first one's by at
 /// most the combined standard error.
 ///
 /// The calibrated margin must agree as well. Size alone may make a large object the first target,
