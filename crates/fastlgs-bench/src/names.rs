@@ -94,7 +94,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     };
     let (left_out, seen) = (mean("miou_left_out"), mean("miou_seen"));
     if let Some(folder) = &args.output {
-        table::write(folder, "names", &COLUMNS, &rows, "")?;
+        table::write(folder, "names", &COLUMNS, &rows)?;
     }
     Ok(json!({
         "rows": rows,

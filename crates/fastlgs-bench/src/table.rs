@@ -6,17 +6,10 @@ use serde_json::{Value, json};
 use std::path::Path;
 
 /// Writes `NAME.json`, `NAME.csv` and `NAME.md` into `folder`. CSV and Markdown hold the given
-/// columns, JSON holds all values. `remarks` follow the Markdown table. Returns the content of the
-/// JSON file.
-pub fn write(
-    folder: &Path,
-    name: &str,
-    columns: &[&str],
-    rows: &[Value],
-    remarks: &str,
-) -> Result<Value> {
-    for (ending, framed, remarks) in [("md", true, remarks), ("csv", false, "")] {
-        let text = text(rows, columns, framed) + remarks;
+/// columns, JSON holds all values. Returns the content of the JSON file.
+pub fn write(folder: &Path, name: &str, columns: &[&str], rows: &[Value]) -> Result<Value> {
+    for (ending, framed) in [("md", true), ("csv", false)] {
+        let text = text(rows, columns, framed);
         fs::write_atomic(&folder.join(format!("{name}.{ending}")), |out| {
             std::io::Write::write_all(out, text.as_bytes())
         })?;

@@ -3,9 +3,14 @@
 //! Measured rows are kept in `rows.json`, so that an interrupted run continues with the next row.
 //! All pages are made from these rows alone.
 
+mod figures;
+mod markdown;
 mod measure;
 mod pages;
 mod plan;
+mod readme;
+mod rows;
+mod stability;
 
 use anyhow::{Context, Result, bail};
 use fastlgs::Run;
@@ -13,7 +18,7 @@ use fastlgs_core::fs;
 use fastlgs_synth::Kind;
 use measure::Measure;
 use plan::{SceneSource, WAYS};
-use serde::{Deserialize, Serialize};
+use rows::Rows;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -49,53 +54,6 @@ pub struct Args {
     /// Folder of rows.json and of all pages and charts.
     #[arg(short, long)]
     output: PathBuf,
-}
-
-/// Version of the measured code: the last commit that changed anything but the bench.
-const VERSION: &str = concat!(
-    env!("CARGO_PKG_VERSION"),
-    ", commit ",
-    env!("FASTLGS_COMMIT")
-);
-
-/// All measured rows. They are of one version.
-#[derive(Serialize, Deserialize)]
-pub struct Rows {
-    pub version: String,
-    /// Each row has `scene`, `way`, `seed` and `machine`, and figures.
-    pub rows: Vec<Value>,
-}
-
-impl Rows {
-    /// Loads the rows of `file`; empty if it is missing.
-    ///
-    /// # Errors
-    /// The file is damaged. If rows are to be added, it has rows of another version.
-    fn load(file: &Path, to_add: bool) -> Result<Self> {
-        if !file.is_file() {
-            return Ok(Self {
-                version: VERSION.to_owned(),
-                rows: Vec::new(),
-            });
-        }
-        let rows: Self = fs::read_json(file)?;
-        if to_add && rows.version != VERSION {
-            bail!(
-                "{}: these rows are of version {}, and this is {VERSION}; remove the file to measure all rows again",
-                file.display(),
-                rows.version
-            );
-        }
-        Ok(rows)
-    }
-
-    fn has(&self, planned: &plan::Planned) -> bool {
-        self.rows.iter().any(|row| {
-            row["scene"] == planned.scene.name.as_str()
-                && row["way"] == planned.way.name
-                && row["seed"] == planned.seed
-        })
-    }
 }
 
 /// Returns the given scenes and the difficult ones.
@@ -184,7 +142,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         let text = String::from_utf8_lossy(&fs::read(readme)?).into_owned();
         write(
             readme,
-            &pages::with_table(&text, &rows).with_context(|| readme.display().to_string())?,
+            &readme::with_table(&text, &rows).with_context(|| readme.display().to_string())?,
         )?;
     }
     let left = missing.iter().filter(|planned| !rows.has(planned)).count();
@@ -200,25 +158,6 @@ fn write(path: &Path, text: &str) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn rows_of_another_version_are_refused() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let file = folder.path().join("rows.json");
-        let rows = Rows::load(&file, true).expect("no rows yet");
-        assert!(rows.rows.is_empty() && rows.version == VERSION);
-        let other = Rows {
-            version: "0.0.1, commit 1234567".to_owned(),
-            ..rows
-        };
-        fs::write_json(&file, &other).expect("written");
-        let message = Rows::load(&file, true).err().expect("refused").to_string();
-        assert!(Rows::load(&file, false).is_ok());
-        assert!(
-            message.contains("1234567") && message.contains("rows.json"),
-            "{message}"
-        );
-    }
 
     #[test]
     fn unknown_and_equal_scenes_are_refused() {
@@ -243,7 +182,7 @@ mod tests {
             );
         }
         let readme = std::fs::read_to_string(root.join("README.md")).expect("the README");
-        let expected = pages::with_table(&readme, &rows).expect("markers");
+        let expected = readme::with_table(&readme, &rows).expect("markers");
         assert!(
             readme == expected,
             "README.md differs from docs/results/rows.json"

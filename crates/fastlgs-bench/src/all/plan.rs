@@ -268,6 +268,12 @@ pub const WAYS: &[Way] = {
     ]
 };
 
+/// Returns the ways of a page, [`BASE`] included.
+pub fn on(page: Page) -> impl Iterator<Item = &'static Way> {
+    WAYS.iter()
+        .filter(move |way| way.page == page || way.name == BASE)
+}
+
 /// Generated scenes that are difficult.
 pub const DIFFICULT: [&str; 10] = [
     "twins",

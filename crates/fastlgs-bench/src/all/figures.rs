@@ -1,0 +1,99 @@
+//! Figures of rows over their seeds.
+
+use super::plan::BASE;
+use super::rows::Rows;
+use serde_json::Value;
+use std::collections::BTreeSet;
+
+/// A figure over the seeds of a way.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Mean {
+    pub mean: f64,
+    pub low: f64,
+    pub high: f64,
+}
+
+impl Mean {
+    fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
+        let values: Vec<f64> = values.into_iter().collect();
+        let fold = |pick: fn(f64, f64) -> f64| values.iter().copied().reduce(pick);
+        Some(Self {
+            mean: values.iter().sum::<f64>() / values.len() as f64,
+            low: fold(f64::min)?,
+            high: fold(f64::max)?,
+        })
+    }
+
+    /// Formats mean and range; the mean alone if all values are the same.
+    pub fn text(self, digits: usize) -> String {
+        let Self { mean, low, high } = self;
+        let [mean, low, high] = [mean, low, high].map(|v| format!("{v:.digits$}"));
+        if low == high {
+            mean
+        } else {
+            format!("{mean} ({low} to {high})")
+        }
+    }
+}
+
+/// The rows of a way on a scene, one for each seed.
+pub struct Runs<'a>(pub Vec<&'a Value>);
+
+impl<'a> Runs<'a> {
+    pub fn of(rows: &'a Rows, scene: &str, way: &str) -> Option<Self> {
+        let is_run = |row: &&Value| row["scene"] == scene && row["way"] == way;
+        let runs: Vec<&Value> = rows.rows.iter().filter(is_run).collect();
+        (!runs.is_empty()).then_some(Self(runs))
+    }
+
+    pub fn mean(&self, figure: &str) -> Option<Mean> {
+        Mean::of(self.0.iter().filter_map(|row| row[figure].as_f64()))
+    }
+
+    /// Seconds from photos to answers, or of one stage.
+    pub fn seconds(&self, stage: Option<&str>) -> Option<Mean> {
+        let of = |row: &&Value| match stage {
+            Some(stage) => row["seconds"][stage].as_f64(),
+            None => Some(
+                row["seconds"]
+                    .as_object()?
+                    .values()
+                    .filter_map(Value::as_f64)
+                    .sum(),
+            ),
+        };
+        Mean::of(self.0.iter().filter_map(of))
+    }
+
+    pub fn text(&self, figure: &str, digits: usize) -> String {
+        self.mean(figure)
+            .map_or(String::new(), |mean| mean.text(digits))
+    }
+
+    /// Change of a figure against other runs with the same seed, in points.
+    pub fn change(&self, figure: &str, reference: &Self) -> Option<Mean> {
+        Mean::of(self.0.iter().filter_map(|row| {
+            let same = reference
+                .0
+                .iter()
+                .find(|other| other["seed"] == row["seed"])?;
+            Some(100.0 * (row[figure].as_f64()? - same[figure].as_f64()?))
+        }))
+    }
+}
+
+/// Returns the distinct texts of a field, in order of their first row.
+pub fn distinct<'a>(rows: &'a Rows, field: &str) -> Vec<&'a str> {
+    let mut seen = BTreeSet::new();
+    let texts = rows.rows.iter().filter_map(|row| row[field].as_str());
+    texts.filter(|text| seen.insert(*text)).collect()
+}
+
+/// Returns the scenes that have the default way: the given ones.
+pub fn given(rows: &Rows) -> Vec<&str> {
+    let has_base = |scene: &&str| Runs::of(rows, scene, BASE).is_some();
+    distinct(rows, "scene")
+        .into_iter()
+        .filter(has_base)
+        .collect()
+}

@@ -1,0 +1,39 @@
+//! What all pages have in common.
+
+use super::figures::distinct;
+use super::rows::Rows;
+use std::collections::BTreeSet;
+
+/// Returns a Markdown table.
+pub fn table(head: &[&str], lines: &[Vec<String>]) -> String {
+    let line = |cells: Vec<&str>| format!("| {} |\n", cells.join(" | "));
+    let mut text = line(head.to_vec()) + &line(vec!["---"; head.len()]);
+    for cells in lines {
+        text += &line(cells.iter().map(String::as_str).collect());
+    }
+    text
+}
+
+/// States what the figures of a page were measured with.
+pub fn stamp(rows: &Rows) -> String {
+    let seeds: BTreeSet<u64> = rows
+        .rows
+        .iter()
+        .filter_map(|row| row["seed"].as_u64())
+        .collect();
+    format!(
+        "FastLGS {}. {}. Device: {}. Seeds: {}.\n",
+        rows.version,
+        distinct(rows, "machine").join("; "),
+        distinct(rows, "adapter").join("; "),
+        seeds
+            .iter()
+            .map(u64::to_string)
+            .collect::<Vec<_>>()
+            .join(", "),
+    )
+}
+
+pub const HOW_TO_READ: &str = "Means over the seeds, with their range in brackets. *Best object*: IoU of the best \
+single object, mean over the labels of held-out views. *Text*: IoU of the answer to the label's name. *Right*: \
+answers with an IoU of a half at least. *Seconds*: from photos to answers.\n";

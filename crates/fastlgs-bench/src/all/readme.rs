@@ -1,0 +1,107 @@
+//! The table of figures in the README.
+
+use super::figures::{Runs, given};
+use super::markdown::{stamp, table};
+use super::plan::BASE;
+use super::rows::Rows;
+use anyhow::{Context, Result};
+use serde_json::Value;
+
+/// Markers of the generated part of the README.
+const MARKERS: [&str; 2] = [
+    "<!-- figures: fastlgs-bench all -->\n",
+    "<!-- end of figures -->",
+];
+
+/// Returns the README with the table between its markers made from `rows`.
+///
+/// # Errors
+/// A marker is missing.
+pub fn with_table(readme: &str, rows: &Rows) -> Result<String> {
+    let (before, rest) = readme
+        .split_once(MARKERS[0])
+        .context("no marker of figures")?;
+    let (_, after) = rest
+        .split_once(MARKERS[1])
+        .context("no marker of the end of figures")?;
+    let [begin, end] = MARKERS;
+    Ok(format!("{before}{begin}{}{end}{after}", readme_table(rows)))
+}
+
+fn readme_table(rows: &Rows) -> String {
+    let scenes: Vec<(&str, Runs)> = given(rows)
+        .into_iter()
+        .filter_map(|scene| Some((scene, Runs::of(rows, scene, BASE)?)))
+        .collect();
+    let line = |name: &str, of: &dyn Fn(&Runs) -> String| {
+        std::iter::once(name.to_owned())
+            .chain(scenes.iter().map(|(_, runs)| of(runs)))
+            .collect::<Vec<String>>()
+    };
+    let first = |runs: &Runs, name: &str| match &runs.0[0][name] {
+        Value::String(text) => text.clone(),
+        other => other.to_string(),
+    };
+    let rounded = |runs: &Runs, name: &str| {
+        runs.mean(name)
+            .map_or(String::new(), |m| format!("{:.0}", m.mean))
+    };
+    let lines = [
+        line("seeds", &|runs| runs.0.len().to_string()),
+        line("training photos; Gaussians", &|runs| {
+            format!("{}; {}", first(runs, "photos"), rounded(runs, "gaussians"))
+        }),
+        line("colour of held-out views, dB", &|runs| runs.text("psnr", 1)),
+        line("IoU of the best object, mean over labels", &|runs| {
+            runs.text("oracle_miou", 2)
+        }),
+        line("IoU of the answer to a text, mean over labels", &|runs| {
+            runs.text("miou", 2)
+        }),
+        line("texts that are answered correctly", &|runs| {
+            let right = runs.text("right", 1).replace(".0", "");
+            format!("{right} of {}", first(runs, "labels"))
+        }),
+        line("absent texts that are refused", &|runs| {
+            format!(
+                "{} of {}",
+                runs.text("absent_rejected", 0),
+                first(runs, "absent_texts")
+            )
+        }),
+        line("seconds from photos to answers", &|runs| {
+            runs.seconds(None).map_or(String::new(), |s| s.text(0))
+        }),
+    ];
+    let titles: Vec<String> = scenes
+        .iter()
+        .map(|(scene, runs)| format!("{scene}, {}", first(runs, "size")))
+        .collect();
+    let head: Vec<&str> = std::iter::once("")
+        .chain(titles.iter().map(String::as_str))
+        .collect();
+    format!(
+        "{}\n{}\n![accuracy against seconds from photos to answers](docs/results/speed.svg)\n",
+        stamp(rows),
+        table(&head, &lines)
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::pages::tests::rows;
+    use super::*;
+
+    #[test]
+    fn the_readme_changes_between_its_markers_only() {
+        let readme = format!("# Title\n{}old\n{}\nmore\n", MARKERS[0], MARKERS[1]);
+        let new = with_table(&readme, &rows()).expect("markers");
+        assert!(new.starts_with("# Title\n") && new.ends_with("\nmore\n") && !new.contains("old"));
+        assert!(
+            new.contains("0.85 (0.80 to 0.90)") && new.contains("2 of 4"),
+            "{new}"
+        );
+        assert_eq!(with_table(&new, &rows()).expect("markers"), new);
+        assert!(with_table("no marker", &rows()).is_err());
+    }
+}
