@@ -1,4 +1,4 @@
-//! Embeds the commit of the measured code: the last one that changed anything but the bench itself.
+//! Embeds commit and date of the measured code: the last one that changed anything but the bench itself.
 
 use std::process::Command;
 
@@ -24,7 +24,7 @@ fn main() {
         let output = output.ok().filter(|output| output.status.success());
         output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned())
     };
-    let commit = git(&["log", "-1", "--format=%h"]).unwrap_or_default();
+    let commit = git(&["log", "-1", "--format=%h of %cs"]).unwrap_or_default();
     let changed = git(&["status", "--porcelain"]).is_some_and(|changes| !changes.is_empty());
     let version = match (commit.is_empty(), changed) {
         (true, _) => "unknown",

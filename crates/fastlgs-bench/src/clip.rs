@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 #[command(after_help = "Example: fastlgs-bench clip ../shared/data/clip --json clip.json")]
 pub struct Args {
     /// Folder of texts.json, texts.npy, and ROOM.npy with ROOM.views.npy for each room.
-    folder: PathBuf,
+    pub folder: PathBuf,
 }
 
 /// Shares of (room, name) pairs that are found, by group of names.

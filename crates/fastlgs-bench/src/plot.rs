@@ -194,6 +194,8 @@ pub struct Panel {
     pub points: Vec<Point>,
 }
 
+/// Colour of points.
+const COLOR: RGBColor = RGBColor(20, 80, 160);
 /// Smallest span of a y axis.
 const MIN_SPAN: f64 = 0.1;
 
@@ -201,6 +203,13 @@ const MIN_SPAN: f64 = 0.1;
 fn two_digits(value: f64) -> String {
     let decimals = (1.0 - value.abs().max(1e-9).log10().floor()).max(0.0) as usize;
     format!("{value:.decimals$}")
+}
+
+/// Returns round numbers of a range for a logarithmic axis.
+fn ticks(left: f64, right: f64) -> Vec<f64> {
+    let decades = left.log10().floor() as i32..=right.log10().floor() as i32;
+    let numbers = decades.flat_map(|k| [1.0, 1.5, 2.0, 3.0, 5.0, 7.0].map(|n| n * 10f64.powi(k)));
+    numbers.filter(|x| (left..=right).contains(x)).collect()
 }
 
 /// Scatter charts beside each other, with logarithmic x axes and the names of their points.
@@ -214,12 +223,7 @@ impl Panels<'_> {
     const PANEL: (u32, u32) = (560, 400);
     const TITLE: u32 = 40;
 
-    fn draw_panel<DB: DrawingBackend>(
-        &self,
-        area: &DrawingArea<DB, Shift>,
-        panel: &Panel,
-        color: RGBAColor,
-    ) -> Drawn
+    fn draw_panel<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, panel: &Panel) -> Drawn
     where
         DB::ErrorType: 'static,
     {
@@ -239,29 +243,30 @@ impl Panels<'_> {
         // Differences that seeds make alone do not fill the chart.
         let margin = 0.1 * (high - low) + 0.5 * (MIN_SPAN - (high - low)).max(0.0);
         // The names need room to the right of their points.
-        let (left, right) = (left.log10(), right.log10());
-        let x = left - 0.08..right + 0.2 + 0.5 * (right - left);
+        let (left, right) = (0.85 * left, 1.6 * right * (right / left).sqrt());
+        let x = (left..right).log_scale();
         let axes = Axes {
             title: &panel.name,
             ..self.axes
         };
-        let mut chart = titled(area, &axes).build_cartesian_2d(x, low - margin..high + margin)?;
+        let mut chart = titled(area, &axes).build_cartesian_2d(
+            x.with_key_points(ticks(left, right)),
+            low - margin..high + margin,
+        )?;
         chart
             .configure_mesh()
+            .disable_x_mesh()
+            .max_light_lines(0)
             .x_desc(axes.x)
             .y_desc(axes.y)
-            .x_labels(6)
             .y_labels(6)
-            .x_label_formatter(&|exponent| two_digits(10f64.powf(*exponent)))
+            .x_label_formatter(&|x| two_digits(*x))
             .draw()?;
-        let mut front: Vec<(f64, f64)> = points()
-            .filter(|p| p.front)
-            .map(|p| (p.x.log10(), p.y))
-            .collect();
+        let mut front: Vec<(f64, f64)> = points().filter(|p| p.front).map(|p| (p.x, p.y)).collect();
         front.sort_by(|a, b| a.0.total_cmp(&b.0));
-        chart.draw_series(LineSeries::new(front, color.stroke_width(1)))?;
+        chart.draw_series(LineSeries::new(front, COLOR.stroke_width(1)))?;
         chart.draw_series(points().map(|p| {
-            let ends = vec![(p.x.log10(), p.range.0), (p.x.log10(), p.range.1)];
+            let ends = vec![(p.x, p.range.0), (p.x, p.range.1)];
             PathElement::new(ends, BLACK.mix(0.4).stroke_width(1))
         }))?;
         let mut sorted: Vec<&Point> = points().collect();
@@ -270,7 +275,7 @@ impl Panels<'_> {
         let mut names: Vec<(i32, i32)> = Vec::new();
         let mut places = Vec::new();
         for point in &sorted {
-            let (x, mut y) = chart.backend_coord(&(point.x.log10(), point.y));
+            let (x, mut y) = chart.backend_coord(&(point.x, point.y));
             let own = y;
             while names
                 .iter()
@@ -283,11 +288,11 @@ impl Panels<'_> {
         }
         chart.draw_series(sorted.iter().zip(places).map(|(p, shift)| {
             let style = if p.front {
-                color.filled()
+                COLOR.filled()
             } else {
-                color.stroke_width(1)
+                COLOR.stroke_width(1)
             };
-            EmptyElement::at((p.x.log10(), p.y))
+            EmptyElement::at((p.x, p.y))
                 + Circle::new((0, 0), 4, style)
                 + Text::new(p.name.clone(), (7, shift - 6), (FONT, 11))
         }))?;
@@ -312,8 +317,8 @@ impl Drawing for Panels<'_> {
         title.draw(&Text::new(self.axes.title.to_owned(), (16, 12), (FONT, 20)))?;
         let rows = self.panels.len().max(1).div_ceil(Self::COLUMNS);
         let places = rest.split_evenly((rows, Self::COLUMNS));
-        for (k, (panel, place)) in self.panels.iter().zip(&places).enumerate() {
-            self.draw_panel(place, panel, Palette99::pick(k).to_rgba())?;
+        for (panel, place) in self.panels.iter().zip(&places) {
+            self.draw_panel(place, panel)?;
         }
         Ok(())
     }
@@ -323,8 +328,8 @@ impl Drawing for Panels<'_> {
 #[derive(Clone)]
 pub struct Cell {
     pub text: String,
-    /// Shade from -1 (red, worse) over 0 (white, unchanged) to 1 (green, better).
-    pub shade: f64,
+    /// Shade from -1 (red, worse) over 0 (white, unchanged) to 1 (green, better). Grey if there is none.
+    pub shade: Option<f64>,
 }
 
 /// A table with coloured cells.
@@ -368,12 +373,12 @@ impl Drawing for HeatMap<'_> {
             let top = Self::HEAD + Self::ROW * row as i32;
             area.draw(&Text::new(name.clone(), (8, top + 4), (FONT, 13)))?;
             for (k, cell) in cells.iter().enumerate() {
-                let depth = cell.shade.clamp(-1.0, 1.0);
+                let depth = cell.shade.unwrap_or(0.0).clamp(-1.0, 1.0);
                 let fade = |full: f64| (255.0 - depth.abs() * (255.0 - full)) as u8;
-                let color = if depth < 0.0 {
-                    RGBColor(fade(225.0), fade(80.0), fade(70.0))
-                } else {
-                    RGBColor(fade(90.0), fade(180.0), fade(110.0))
+                let color = match cell.shade {
+                    None => RGBColor(240, 240, 240),
+                    Some(_) if depth < 0.0 => RGBColor(fade(225.0), fade(80.0), fade(70.0)),
+                    Some(_) => RGBColor(fade(90.0), fade(180.0), fade(110.0)),
                 };
                 area.draw(&Rectangle::new(
                     [
@@ -396,6 +401,12 @@ impl Drawing for HeatMap<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn ticks_are_round_numbers_in_the_range() {
+        assert_eq!(ticks(60.0, 210.0), [70.0, 100.0, 150.0, 200.0]);
+        assert_eq!(ticks(0.4, 1.2), [0.5, 0.7, 1.0]);
+    }
 
     #[test]
     fn labels_have_two_digits() {
@@ -437,7 +448,7 @@ mod tests {
             "row".to_owned(),
             vec![Cell {
                 text: "-3".to_owned(),
-                shade: -1.0,
+                shade: Some(-1.0),
             }],
         )];
         save(

@@ -1,7 +1,7 @@
 //! Trials: commands of `fastlgs` on copies of scenes. Each figure can thus be reproduced by hand.
 
 use crate::command::run_command;
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use fastlgs::Run;
 use fastlgs_core::SceneFolder;
 use serde_json::Value;
@@ -25,26 +25,19 @@ pub struct Trial<'a> {
     folder: tempfile::TempDir,
     /// `scene.ply` of the original scene.
     start: PathBuf,
-    labels: PathBuf,
+    labels: Option<PathBuf>,
     run: Run<'a>,
 }
 
 impl<'a> Trial<'a> {
     /// Copies `scene` into `work`. Uses hard links where possible, because the program replaces
-    /// whole files and never writes into one. The labels are those beside the scene's photos.
+    /// whole files and never writes into one. The labels are those beside the scene's photos, if any.
     ///
     /// # Errors
-    /// The scene is damaged, has no labels, or cannot be copied.
+    /// The scene is damaged or cannot be copied.
     pub fn new(scene: &Path, work: &Path, run: &Run<'a>) -> Result<Self> {
         let manifest = SceneFolder::open(scene)?.manifest()?;
         let labels = Path::new(&manifest.photos).join("labels");
-        if !labels.is_dir() {
-            bail!(
-                "{}: no labels; this bench needs them beside the photos of {}",
-                labels.display(),
-                scene.display()
-            );
-        }
         let source = scene.canonicalize()?;
         let folder = tempfile::tempdir_in(work).with_context(|| work.display().to_string())?;
         link_all(&source, &folder.path().join("scene"))
@@ -52,7 +45,7 @@ impl<'a> Trial<'a> {
         Ok(Self {
             folder,
             start: source.join("scene.ply"),
-            labels,
+            labels: labels.is_dir().then_some(labels),
             run: *run,
         })
     }
@@ -80,22 +73,22 @@ impl<'a> Trial<'a> {
         run_command(&self.run, seed, "train", &all)
     }
 
-    /// Evaluates the copy against the labels, and returns the report.
-    pub fn eval(&self, args: &[&str]) -> Result<Value> {
-        let scene = self.scene();
-        let first = [text(&scene.root), "--labels", text(&self.labels)];
-        run_command(&self.run, self.run.seed, "eval", &[&first, args].concat())
+    /// Evaluates the copy, and returns the report.
+    pub fn eval(&self) -> Result<Value> {
+        self.eval_of(&self.scene().root)
     }
 
-    /// Evaluates another folder of the same scene against the labels, and returns the report.
+    /// Evaluates another folder of the same scene, and returns the report.
     pub fn eval_of(&self, scene: &Path) -> Result<Value> {
-        run_command(
-            &self.run,
-            self.run.seed,
-            "eval",
-            &[text(scene), "--labels", text(&self.labels)],
-        )
+        evaluate(&self.run, self.run.seed, scene, self.labels.as_deref())
     }
+}
+
+/// Evaluates a scene, against labels if there are any, and returns the report.
+pub fn evaluate(run: &Run, seed: u64, scene: &Path, labels: Option<&Path>) -> Result<Value> {
+    let against = labels.map(|folder| ["--labels", text(folder)]);
+    let args = [&[text(scene)], against.as_slice().as_flattened()].concat();
+    run_command(run, seed, "eval", &args)
 }
 
 fn link_all(from: &Path, to: &Path) -> std::io::Result<()> {

@@ -14,7 +14,7 @@ pub struct Mean {
 }
 
 impl Mean {
-    fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
+    pub fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
         let values: Vec<f64> = values.into_iter().collect();
         let fold = |pick: fn(f64, f64) -> f64| values.iter().copied().reduce(pick);
         Some(Self {
@@ -54,13 +54,7 @@ impl<'a> Runs<'a> {
     pub fn seconds(&self, stage: Option<&str>) -> Option<Mean> {
         let of = |row: &&Value| match stage {
             Some(stage) => row["seconds"][stage].as_f64(),
-            None => Some(
-                row["seconds"]
-                    .as_object()?
-                    .values()
-                    .filter_map(Value::as_f64)
-                    .sum(),
-            ),
+            None => total_seconds(row),
         };
         Mean::of(self.0.iter().filter_map(of))
     }
@@ -70,16 +64,30 @@ impl<'a> Runs<'a> {
             .map_or(String::new(), |mean| mean.text(digits))
     }
 
-    /// Change of a figure against other runs with the same seed, in points.
-    pub fn change(&self, figure: &str, reference: &Self) -> Option<Mean> {
+    /// A comparison with the rows of other runs that have the same seed.
+    pub fn against(
+        &self,
+        reference: &Self,
+        compare: impl Fn(&Value, &Value) -> Option<f64>,
+    ) -> Option<Mean> {
         Mean::of(self.0.iter().filter_map(|row| {
-            let same = reference
-                .0
-                .iter()
-                .find(|other| other["seed"] == row["seed"])?;
-            Some(100.0 * (row[figure].as_f64()? - same[figure].as_f64()?))
+            let is_same = |other: &&&Value| other["seed"] == row["seed"];
+            compare(row, reference.0.iter().find(is_same)?)
         }))
     }
+
+    /// Change of a figure against other runs with the same seed, in points.
+    pub fn change(&self, figure: &str, reference: &Self) -> Option<Mean> {
+        self.against(reference, |row, other| {
+            Some(100.0 * (row[figure].as_f64()? - other[figure].as_f64()?))
+        })
+    }
+}
+
+/// Seconds of all stages of a row.
+pub fn total_seconds(row: &Value) -> Option<f64> {
+    let stages = row["seconds"].as_object()?.values();
+    Some(stages.filter_map(Value::as_f64).sum())
 }
 
 /// Returns the distinct texts of a field, in order of their first row.
@@ -96,4 +104,12 @@ pub fn given(rows: &Rows) -> Vec<&str> {
         .into_iter()
         .filter(has_base)
         .collect()
+}
+
+/// Returns the given scenes with labels.
+pub fn labelled(rows: &Rows) -> Vec<&str> {
+    let has_labels = |scene: &&str| {
+        Runs::of(rows, scene, BASE).is_some_and(|runs| runs.mean("oracle_miou").is_some())
+    };
+    given(rows).into_iter().filter(has_labels).collect()
 }

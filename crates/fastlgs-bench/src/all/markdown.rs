@@ -35,5 +35,5 @@ pub fn stamp(rows: &Rows) -> String {
 }
 
 pub const HOW_TO_READ: &str = "Means over the seeds, with their range in brackets. *Best object*: IoU of the best \
-single object, mean over the labels of held-out views. *Text*: IoU of the answer to the label's name. *Right*: \
-answers with an IoU of a half at least. *Seconds*: from photos to answers.\n";
+single object, mean over the labels of held-out views. *Text*: IoU of the answer to the label's name. \
+*Seconds*: from photos to answers.\n";

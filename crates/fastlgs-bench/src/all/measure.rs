@@ -3,7 +3,7 @@
 use super::plan::{BASE, How, Planned, SceneSource};
 use crate::command::run_command;
 use crate::disturb::{self, Album, PhotoChange};
-use crate::trial::{Trial, text};
+use crate::trial::{Trial, evaluate, text};
 use anyhow::{Context, Result};
 use fastlgs::{Run, SceneNotes};
 use fastlgs_core::{Gaussians, SceneFolder, fs, ply};
@@ -99,7 +99,7 @@ impl Measure<'_> {
                 &before["train"],
                 &trained["mapping_seconds"],
             );
-            Ok(figures(&trial.eval(&[])?, spent))
+            Ok(figures(&trial.eval()?, spent))
         };
         let remap = |options: &[&str]| remap_from("SCENE/scene.ply", options);
         match planned.way.how {
@@ -111,7 +111,7 @@ impl Measure<'_> {
                     &trained["seconds"],
                     &trained["mapping_seconds"],
                 );
-                Ok(figures(&trial.eval(&[])?, spent))
+                Ok(figures(&trial.eval()?, spent))
             }
             How::Remap(options) => remap(options),
             How::Masks(change) => {
@@ -120,7 +120,7 @@ impl Measure<'_> {
             }
             How::Embeddings(noise) => {
                 disturb::embeddings(&folder, noise, seed + 1)?;
-                Ok(figures(&trial.eval(&[])?, done))
+                Ok(figures(&trial.eval()?, done))
             }
             How::Baseline(method) => self.baseline(method, &trial, &base, seed),
             How::Format(ending) => {
@@ -139,14 +139,14 @@ impl Measure<'_> {
                     &folder.ply_path(),
                     &folder.gaussians()?.with_sh_degree(degree),
                 )?;
-                Ok(figures(&trial.eval(&[])?, done))
+                Ok(figures(&trial.eval()?, done))
             }
             How::Kept(share) => {
                 let all = folder.gaussians()?;
                 let mut kept = most_important(&folder, &all, share)?;
                 kept.sort_unstable();
                 ply::write(&folder.ply_path(), &all.select(&kept))?;
-                Ok(figures(&trial.eval(&[])?, done))
+                Ok(figures(&trial.eval()?, done))
             }
         }
     }
@@ -207,12 +207,8 @@ impl Measure<'_> {
         let prepared = run_command(self.run, seed, "preprocess", &arguments)?;
         let training = self.with_iterations(&[text(scene), "--preset", BASE]);
         let trained = run_command(self.run, seed, "train", &training)?;
-        let scored = run_command(
-            self.run,
-            seed,
-            "eval",
-            &[text(scene), "--labels", text(labels)],
-        )?;
+        let labels = labels.is_dir().then_some(labels);
+        let scored = evaluate(self.run, seed, scene, labels)?;
         let spent = seconds(
             &prepared["seconds_total"],
             &trained["seconds"],

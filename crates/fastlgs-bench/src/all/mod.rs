@@ -11,7 +11,10 @@ mod plan;
 mod readme;
 mod rows;
 mod stability;
+mod summary;
+mod texts;
 
+use crate::clip;
 use anyhow::{Context, Result, bail};
 use fastlgs::Run;
 use fastlgs_core::fs;
@@ -36,6 +39,9 @@ pub struct Args {
     /// only writes the pages again.
     #[arg(long, value_delimiter = ',', value_name = "NAMES")]
     ways: Vec<String>,
+    /// Folder of real CLIP embeddings, for `fastlgs-bench clip`.
+    #[arg(long, value_name = "FOLDER")]
+    clip: Option<PathBuf>,
     /// Number of seeds.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..))]
     seeds: u64,
@@ -135,6 +141,10 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         fs::write_json(&file, &rows)?;
         progress.advance()?;
     }
+    if let Some(folder) = args.clip.clone().filter(|_| rows.clip.is_none()) {
+        rows.clip = Some(serde_json::to_value(clip::run(&clip::Args { folder })?)?);
+        fs::write_json(&file, &rows)?;
+    }
     for (name, text) in pages::all(&rows)? {
         write(&args.output.join(name), &text)?;
     }
@@ -142,7 +152,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         let text = String::from_utf8_lossy(&fs::read(readme)?).into_owned();
         write(
             readme,
-            &readme::with_table(&text, &rows).with_context(|| readme.display().to_string())?,
+            &readme::with_figures(&text, &rows).with_context(|| readme.display().to_string())?,
         )?;
     }
     let left = missing.iter().filter(|planned| !rows.has(planned)).count();
@@ -182,7 +192,7 @@ mod tests {
             );
         }
         let readme = std::fs::read_to_string(root.join("README.md")).expect("the README");
-        let expected = readme::with_table(&readme, &rows).expect("markers");
+        let expected = readme::with_figures(&readme, &rows).expect("markers");
         assert!(
             readme == expected,
             "README.md differs from docs/results/rows.json"

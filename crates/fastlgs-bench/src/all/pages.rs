@@ -1,10 +1,11 @@
 //! Tables and charts of `fastlgs-bench all`, made from its rows alone.
 
-use super::figures::{Mean, Runs, distinct, given};
+use super::figures::{Mean, Runs, distinct, given, labelled};
 use super::markdown::{HOW_TO_READ, stamp, table};
-use super::plan::{BASE, Page, WAYS, Way, on};
+use super::plan::{BASE, Page, UNLIMITED, Way, on};
 use super::rows::Rows;
 use super::stability;
+use super::{summary, texts};
 use crate::plot::{self, Axes, Panel, Panels, Point};
 use anyhow::Result;
 use std::fmt::Write as _;
@@ -13,6 +14,7 @@ use std::fmt::Write as _;
 pub fn all(rows: &Rows) -> Result<Vec<(String, String)>> {
     let mut files = vec![
         ("README.md".to_owned(), index(rows)),
+        ("texts.md".to_owned(), texts::page(rows)),
         ("speed.md".to_owned(), speed(rows)),
         ("stability.md".to_owned(), stability::page(rows)),
         ("size.md".to_owned(), size(rows)),
@@ -22,38 +24,28 @@ pub fn all(rows: &Rows) -> Result<Vec<(String, String)>> {
     let charts = [
         (
             "speed.svg",
-            panels(
-                rows,
-                &[Page::Speed, Page::Paper],
-                |runs| runs.seconds(None),
-                best,
-            ),
+            panels(rows, Page::Speed, |runs| runs.seconds(None), best),
             "Accuracy against time: from photos to answers",
             "seconds",
             "best object, mean IoU",
         ),
         (
             "query.svg",
-            panels(
-                rows,
-                &[Page::Speed, Page::Paper],
-                |runs| runs.mean("query_ms_first"),
-                best,
-            ),
+            panels(rows, Page::Speed, |runs| runs.mean("query_ms_first"), best),
             "Accuracy against time: first answer in a view",
             "milliseconds",
             "best object, mean IoU",
         ),
         (
             "size.svg",
-            panels(rows, &[Page::Size], megabytes, best),
+            panels(rows, Page::Size, megabytes, best),
             "Accuracy against size",
             "megabytes",
             "best object, mean IoU",
         ),
         (
             "size-psnr.svg",
-            panels(rows, &[Page::Size], megabytes, |runs| runs.mean("psnr")),
+            panels(rows, Page::Size, megabytes, |runs| runs.mean("psnr")),
             "Colour against size",
             "megabytes",
             "PSNR of held-out views, dB",
@@ -79,7 +71,7 @@ fn megabytes(runs: &Runs) -> Option<Mean> {
 /// Returns a panel for each given scene: the ways of these pages, with their Pareto front.
 fn panels(
     rows: &Rows,
-    pages: &[Page],
+    page: Page,
     x: impl Fn(&Runs) -> Option<Mean>,
     y: impl Fn(&Runs) -> Option<Mean>,
 ) -> Vec<Panel> {
@@ -95,17 +87,15 @@ fn panels(
         })
     };
     let panel = |scene: &str| {
-        let ways = WAYS
-            .iter()
-            .filter(|way| way.name == BASE || pages.contains(&way.page));
-        let mut points: Vec<Point> = ways.filter_map(|way| point(scene, way)).collect();
+        let mut points: Vec<Point> = on(page).filter_map(|way| point(scene, way)).collect();
         mark_front(&mut points);
         Panel {
             name: scene.to_owned(),
             points,
         }
     };
-    given(rows).into_iter().map(panel).collect()
+    let panels = given(rows).into_iter().map(panel);
+    panels.filter(|panel| panel.points.len() > 1).collect()
 }
 
 /// Marks the Pareto-optimal points: no other point has at most its x and at least its y.
@@ -128,6 +118,7 @@ fn index(rows: &Rows) -> String {
     );
     for (page, about) in [
         ("speed", "accuracy against time"),
+        ("texts", "answers to texts"),
         (
             "stability",
             "disturbed photos and masks, and difficult scenes",
@@ -140,9 +131,19 @@ fn index(rows: &Rows) -> String {
     text += "- [peers](../research/peers.md): OpenSplat and Brush, measured by hand\n";
     let _ = write!(
         text,
-        "\nScenes: {scenes}; {} rows in [rows.json](rows.json). One command makes all rows that are missing, and \
-         all pages; `--ways \"blur 2 px\"` makes one way alone:\n\n```sh\nfastlgs-bench all --scenes {} -o docs/results \
-         --readme README.md --device cpu\n```\n",
+        "\n## What fails\n\n{}\n## All ways\n\nEach against *{BASE}*, the default, with the same seed; fewer photos \
+         against the photos as they are. Mean over the scenes, with their range in brackets. *Time*: from photos to \
+         answers. *Size*: all files that a query needs. *Best object*: IoU of the best single object, *text*: IoU of \
+         the answer to a label's name, both in points (hundredths).\n\n{}",
+        summary::failures(rows),
+        summary::changes(rows)
+    );
+    let _ = write!(
+        text,
+        "\n## Make them again\n\nScenes: {scenes}; {} rows in [rows.json](rows.json). One command makes all rows that are missing, and \
+         all pages. The second makes one row again, in a folder of its own:\n\n```sh\nfastlgs-bench all --scenes {} -o docs/results \
+         --readme README.md --device cpu\nfastlgs-bench all --scenes fox --ways \"blur 2 px\" --seeds 1 -o again --device cpu\n```\n\n\
+         Names of scenes are folders of photos with `labels/` beside them, or kinds of generated scenes.\n",
         rows.rows.len(),
         given(rows).join(","),
     );
@@ -153,7 +154,7 @@ fn speed(rows: &Rows) -> String {
     let mut lines = Vec::new();
     let chart = panels(
         rows,
-        &[Page::Speed, Page::Paper],
+        Page::Speed,
         |runs| runs.seconds(None),
         |runs| runs.mean("oracle_miou"),
     );
@@ -240,8 +241,49 @@ fn size(rows: &Rows) -> String {
     ];
     format!(
         "# Size against accuracy\n\n{}\n{HOW_TO_READ}*MB*: all files that a query needs.\n\n![accuracy against \
-         size](size.svg)\n\n![colour against size](size-psnr.svg)\n\n{}",
+         size](size.svg)\n\n![colour against size](size-psnr.svg)\n\n{}{}",
         stamp(rows),
+        table(&head, &lines),
+        limits(rows)
+    )
+}
+
+/// Returns where the automatic limit of the number of Gaussians stops, and what it costs there.
+fn limits(rows: &Rows) -> String {
+    let line = |scene: &str| {
+        let limited = Runs::of(rows, scene, BASE)?;
+        let free = Runs::of(rows, scene, UNLIMITED)?;
+        let more = free.against(&limited, |row, other| {
+            Some(row["gaussians"].as_f64()? / other["gaussians"].as_f64()?)
+        });
+        let colour = free.against(&limited, |row, other| {
+            Some(row["psnr"].as_f64()? - other["psnr"].as_f64()?)
+        });
+        let objects = free.change("oracle_miou", &limited);
+        let text = |mean: Option<Mean>, digits| mean.map_or(String::new(), |m| m.text(digits));
+        Some(vec![
+            scene.to_owned(),
+            limited.text("gaussians", 0),
+            text(more, 2),
+            text(colour, 2),
+            text(objects, 1),
+        ])
+    };
+    let lines: Vec<Vec<String>> = given(rows).into_iter().filter_map(line).collect();
+    if lines.is_empty() {
+        return String::new();
+    }
+    let head = [
+        "scene",
+        "Gaussians",
+        "without the limit: times as many",
+        "dB gained",
+        "points of best object gained",
+    ];
+    format!(
+        "\n## Where the automatic limit stops\n\nThe limit removes the Gaussians that \
+         together add a twentieth to the remaining squared error of the training views ([how it \
+         works](../how-it-works.md)). What all of them gain in held-out views:\n\n{}",
         table(&head, &lines)
     )
 }
@@ -264,7 +306,7 @@ Of other scenes (SPIn-NeRF's and its own), with CLIP, SAM and a TITAN RTX:
 ";
 
 fn paper(rows: &Rows) -> String {
-    let scenes = given(rows);
+    let scenes = labelled(rows);
     let mut lines = Vec::new();
     for way in on(Page::Paper) {
         let mut line = vec![way.name.to_owned()];
@@ -305,6 +347,7 @@ pub(super) mod tests {
     pub fn rows() -> Rows {
         Rows {
             version: "1.0.0, commit abc".to_owned(),
+            clip: None,
             rows: vec![
                 row("fox", BASE, 0, 0.8, 10.0),
                 row("fox", BASE, 1, 0.9, 12.0),
@@ -324,6 +367,7 @@ pub(super) mod tests {
         let of = |name: &str| &files.iter().find(|f| f.0 == name).expect(name).1;
         for page in [
             "README.md",
+            "texts.md",
             "speed.md",
             "stability.md",
             "size.md",

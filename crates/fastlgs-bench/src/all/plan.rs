@@ -15,12 +15,12 @@ pub enum Page {
 /// Scenes that a way is measured on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum On {
-    /// All given scenes.
+    /// All given scenes. Those without labels have only the ways of [`Page::Size`].
     Given,
     /// The first two given scenes with photos.
     TwoPhotographed,
-    /// Given scenes that are generated.
-    Generated,
+    /// The same with seed 0 alone: 30,000 iterations take an hour.
+    TwoPhotographedOnce,
     /// Scenes generated to be difficult, which need not be given.
     Difficult,
 }
@@ -54,10 +54,27 @@ pub enum How {
 
 /// A way of making a scene.
 pub struct Way {
-    pub page: Page,
+    /// Pages that have it.
+    pub pages: &'static [Page],
     pub name: &'static str,
     pub on: On,
     pub how: How,
+}
+
+impl Way {
+    /// Name of the way whose rows this one is compared with.
+    pub fn reference(&self) -> &'static str {
+        match self.how {
+            How::Photos(_) => UNCHANGED,
+            How::Remap(_) if self.pages == [Page::Stability] => "paper's mapping",
+            _ => BASE,
+        }
+    }
+
+    /// Whether colour and size alone are worth a row.
+    fn needs_no_labels(&self) -> bool {
+        self.pages.contains(&Page::Size) && !matches!(self.how, How::Baseline(_))
+    }
 }
 
 /// The default way: preset quick. It is on all pages, and most ways start from its scene.
@@ -65,9 +82,12 @@ pub const BASE: &str = "quick";
 /// Photos as they are: the reference of disturbed photos.
 pub const UNCHANGED: &str = "photos as they are";
 
-const fn way(page: Page, name: &'static str, on: On, how: How) -> Way {
+/// Training without the automatic limit of the number of Gaussians.
+pub const UNLIMITED: &str = "no limit of Gaussians";
+
+const fn way(pages: &'static [Page], name: &'static str, on: On, how: How) -> Way {
     Way {
-        page,
+        pages,
         name,
         on,
         how,
@@ -79,199 +99,219 @@ pub const WAYS: &[Way] = {
     use How::{
         Baseline, Compact, Degree, Embeddings, Format, Kept, Make, Masks, Photos, Remap, Train,
     };
-    use On::{Difficult, Generated, Given, TwoPhotographed};
+    use On::{Difficult, Given, TwoPhotographed, TwoPhotographedOnce};
     use Page::{Paper, Size, Speed, Stability};
     &[
-        way(Speed, BASE, Given, Make(&[])),
-        way(Stability, "as it is", Difficult, Make(&[])),
+        way(&[Speed, Stability, Size, Paper], BASE, Given, Make(&[])),
+        way(&[Stability], "as it is", Difficult, Make(&[])),
         way(
-            Paper,
+            &[Paper, Speed],
             "paper's mapping",
             Given,
             Remap(&["--mapping", "paper"]),
         ),
         way(
-            Paper,
+            &[Paper],
             "paper's mapping by embeddings and key points",
             Given,
             Remap(&["--mapping", "paper", "--cues", "keypoints"]),
         ),
         way(
-            Paper,
+            &[Paper],
             "paper's mapping by embeddings",
             Given,
             Remap(&["--mapping", "paper", "--cues", "none"]),
         ),
         way(
-            Paper,
+            &[Paper, Speed],
             "mean embeddings without a grid",
             Given,
             Baseline("raw"),
         ),
-        way(Paper, "code of 3 numbers", Given, Baseline("code3")),
-        way(Size, "compact", Given, Compact),
-        way(Size, "SPZ", Given, Format("spz")),
-        way(Size, "SOG", Given, Format("sog")),
-        way(Size, "half of the Gaussians", Given, Kept(0.5)),
-        way(Size, "a quarter of the Gaussians", Given, Kept(0.25)),
-        way(Size, "SH degree 0", Given, Degree(0)),
         way(
-            Stability,
+            &[Paper, Size],
+            "code of 3 numbers",
+            Given,
+            Baseline("code3"),
+        ),
+        way(&[Size], "compact", Given, Compact),
+        way(&[Size], "SPZ", Given, Format("spz")),
+        way(&[Size], "SOG", Given, Format("sog")),
+        way(&[Size], "half of the Gaussians", Given, Kept(0.5)),
+        way(&[Size], "a quarter of the Gaussians", Given, Kept(0.25)),
+        way(&[Size], "SH degree 0", Given, Degree(0)),
+        way(
+            &[Stability],
             UNCHANGED,
             TwoPhotographed,
             Photos(PhotoChange::Unchanged),
         ),
         way(
-            Stability,
+            &[Stability, Speed],
             "half of the photos missing",
             TwoPhotographed,
             Photos(PhotoChange::Missing(0.5)),
         ),
         way(
-            Stability,
+            &[Stability],
             "blur 2 px",
             TwoPhotographed,
             Photos(PhotoChange::Blur(2.0)),
         ),
         way(
-            Stability,
+            &[Stability],
             "exposure 1 stop",
             TwoPhotographed,
             Photos(PhotoChange::Exposure(1.0)),
         ),
         way(
-            Stability,
+            &[Stability],
             "pose noise 4 px",
             TwoPhotographed,
             Photos(PhotoChange::Pose(4.0)),
         ),
         way(
-            Stability,
+            &[Stability],
             "focal length 10 % too long",
             TwoPhotographed,
             Photos(PhotoChange::Focal(0.1)),
         ),
         way(
-            Stability,
+            &[Stability],
             "white balance 20 %",
             TwoPhotographed,
             Photos(PhotoChange::WhiteBalance(0.2)),
         ),
         way(
-            Stability,
+            &[Stability],
             "JPEG quality 15",
             TwoPhotographed,
             Photos(PhotoChange::Jpeg(15)),
         ),
         way(
-            Stability,
+            &[Stability],
             "photos in random order",
             TwoPhotographed,
             Photos(PhotoChange::Shuffled),
         ),
         way(
-            Stability,
+            &[Stability, Speed],
             "three quarters of the photos missing",
             TwoPhotographed,
             Photos(PhotoChange::Missing(0.75)),
         ),
         way(
-            Stability,
+            &[Stability],
+            "masks of whole objects only",
+            TwoPhotographed,
+            Make(&["--levels", "whole"]),
+        ),
+        way(
+            &[Stability],
             "40 % of the masks split",
             Given,
             Masks(MaskChange::Split(0.4)),
         ),
         way(
-            Stability,
+            &[Stability],
             "40 % of the masks merged",
             Given,
             Masks(MaskChange::Merged(0.4)),
         ),
         way(
-            Stability,
+            &[Stability],
             "40 % of the masks missing",
             Given,
             Masks(MaskChange::Dropped(0.4)),
         ),
         way(
-            Stability,
+            &[Stability],
             "masks eroded by 2 px",
             Given,
             Masks(MaskChange::Eroded(2)),
         ),
         way(
-            Stability,
+            &[Stability],
             "noise of half an embedding's length",
             Given,
             Embeddings(0.5),
         ),
         way(
-            Speed,
+            &[Speed, Size],
             "at most 10000 Gaussians",
             Given,
             Train(&["--preset", "quick", "--budget", "10000"]),
         ),
         way(
-            Speed,
+            &[Speed],
             "side 240",
             TwoPhotographed,
             Make(&["--max-side", "240"]),
         ),
-        way(Speed, "standard", Given, Train(&["--preset", "standard"])),
         way(
-            Size,
-            "no limit of Gaussians",
+            &[Speed],
+            "standard",
+            Given,
+            Train(&["--preset", "standard"]),
+        ),
+        way(
+            &[Size, Speed],
+            UNLIMITED,
             Given,
             Train(&["--preset", "quick", "--budget", "1000000"]),
         ),
         way(
-            Speed,
+            &[Speed],
             "side 720",
             TwoPhotographed,
             Make(&["--max-side", "720"]),
         ),
-        way(Paper, "like LangSplat", Given, Baseline("langsplat")),
-        way(Paper, "like LERF", Given, Baseline("lerf")),
-        way(Paper, "code of 1 number", Given, Baseline("code1")),
-        way(Paper, "code of 2 numbers", Given, Baseline("code2")),
-        way(Paper, "code of 4 numbers", Given, Baseline("code4")),
         way(
-            Stability,
+            &[Paper, Speed],
+            "like LangSplat",
+            Given,
+            Baseline("langsplat"),
+        ),
+        way(&[Paper, Speed], "like LERF", Given, Baseline("lerf")),
+        way(&[Size], "code of 1 number", Given, Baseline("code1")),
+        way(&[Size], "code of 2 numbers", Given, Baseline("code2")),
+        way(&[Size], "code of 4 numbers", Given, Baseline("code4")),
+        way(
+            &[Stability],
             "paper: theta 0.98",
-            Generated,
+            Given,
             Remap(&["--mapping", "paper", "--theta", "0.98"]),
         ),
         way(
-            Stability,
+            &[Stability],
             "paper: tau 30",
-            Generated,
+            Given,
             Remap(&["--mapping", "paper", "--tau", "30"]),
         ),
         way(
-            Stability,
+            &[Stability],
             "paper: alpha 0.05",
-            Generated,
+            Given,
             Remap(&["--mapping", "paper", "--alpha", "0.05"]),
         ),
         way(
-            Paper,
+            &[Paper, Speed],
             "all as in the paper",
-            TwoPhotographed,
+            TwoPhotographedOnce,
             Train(&["--preset", "like-paper"]),
         ),
         way(
-            Speed,
+            &[Speed],
             "paper",
-            TwoPhotographed,
+            TwoPhotographedOnce,
             Train(&["--preset", "paper"]),
         ),
     ]
 };
 
-/// Returns the ways of a page, [`BASE`] included.
+/// Returns the ways of a page.
 pub fn on(page: Page) -> impl Iterator<Item = &'static Way> {
-    WAYS.iter()
-        .filter(move |way| way.page == page || way.name == BASE)
+    WAYS.iter().filter(move |way| way.pages.contains(&page))
 }
 
 /// Generated scenes that are difficult.
@@ -294,6 +334,7 @@ pub struct SceneSource {
     pub name: String,
     /// Folder of the photos; `None` if they are generated.
     pub photos: Option<PathBuf>,
+    pub labelled: bool,
     /// Whether the user named it.
     pub given: bool,
 }
@@ -306,6 +347,7 @@ impl SceneSource {
         Self {
             name: name.to_string_lossy().into_owned(),
             photos: folder.is_dir().then(|| folder.to_owned()),
+            labelled: !folder.is_dir() || folder.join("labels").is_dir(),
             given: true,
         }
     }
@@ -327,6 +369,7 @@ pub fn difficult(given: &[SceneSource]) -> Vec<SceneSource> {
         .map(|kind| SceneSource {
             name: (*kind).to_owned(),
             photos: None,
+            labelled: true,
             given: false,
         })
         .collect()
@@ -337,19 +380,19 @@ pub fn difficult(given: &[SceneSource]) -> Vec<SceneSource> {
 pub fn rows(scenes: &[SceneSource], seeds: u64) -> Vec<Planned<'_>> {
     let photographed: Vec<&SceneSource> = scenes
         .iter()
-        .filter(|s| s.given && s.photos.is_some())
+        .filter(|s| s.given && s.photos.is_some() && s.labelled)
         .take(2)
         .collect();
-    let is_on = |scene: &SceneSource, on: On| match on {
-        On::Given => scene.given,
+    let is_on = |scene: &SceneSource, way: &Way, seed: u64| match way.on {
+        On::Given => scene.given && (scene.labelled || way.needs_no_labels()),
         On::TwoPhotographed => photographed.contains(&scene),
-        On::Generated => scene.given && scene.photos.is_none(),
+        On::TwoPhotographedOnce => seed == 0 && photographed.contains(&scene),
         On::Difficult => !scene.given,
     };
     let mut rows = Vec::new();
     for seed in 0..seeds {
         for way in WAYS {
-            let on = scenes.iter().filter(|scene| is_on(scene, way.on));
+            let on = scenes.iter().filter(|scene| is_on(scene, way, seed));
             rows.extend(on.map(|scene| Planned { scene, way, seed }));
         }
     }

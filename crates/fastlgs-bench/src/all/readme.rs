@@ -1,35 +1,49 @@
-//! The table of figures in the README.
+//! Figures in the README.
 
-use super::figures::{Runs, given};
+use super::figures::{Runs, labelled};
 use super::markdown::{stamp, table};
 use super::plan::BASE;
 use super::rows::Rows;
+use super::texts;
 use anyhow::{Context, Result};
 use serde_json::Value;
 
-/// Markers of the generated part of the README.
-const MARKERS: [&str; 2] = [
+/// Markers of the generated table and picture.
+const FIGURES: [&str; 2] = [
     "<!-- figures: fastlgs-bench all -->\n",
     "<!-- end of figures -->",
 ];
+/// Markers of the generated sentence about texts.
+const TEXTS: [&str; 2] = [
+    "<!-- texts: fastlgs-bench all -->\n",
+    "<!-- end of texts -->",
+];
 
-/// Returns the README with the table between its markers made from `rows`.
+/// Returns the README with the parts between its markers made from `rows`.
 ///
 /// # Errors
 /// A marker is missing.
-pub fn with_table(readme: &str, rows: &Rows) -> Result<String> {
-    let (before, rest) = readme
-        .split_once(MARKERS[0])
-        .context("no marker of figures")?;
-    let (_, after) = rest
-        .split_once(MARKERS[1])
-        .context("no marker of the end of figures")?;
-    let [begin, end] = MARKERS;
-    Ok(format!("{before}{begin}{}{end}{after}", readme_table(rows)))
+pub fn with_figures(readme: &str, rows: &Rows) -> Result<String> {
+    let sentence = |text: Option<String>| {
+        text.map_or(String::new(), |mut text| {
+            text[..1].make_ascii_uppercase();
+            text + ".\n"
+        })
+    };
+    let about_texts = sentence(texts::answered(rows)) + &sentence(texts::with_clip(rows));
+    let readme = replaced(readme, TEXTS, &about_texts)?;
+    replaced(&readme, FIGURES, &readme_table(rows))
+}
+
+fn replaced(readme: &str, [begin, end]: [&str; 2], new: &str) -> Result<String> {
+    let missing = |marker: &str| format!("the line '{}' is missing", marker.trim_end());
+    let (before, rest) = readme.split_once(begin).with_context(|| missing(begin))?;
+    let (_, after) = rest.split_once(end).with_context(|| missing(end))?;
+    Ok(format!("{before}{begin}{new}{end}{after}"))
 }
 
 fn readme_table(rows: &Rows) -> String {
-    let scenes: Vec<(&str, Runs)> = given(rows)
+    let scenes: Vec<(&str, Runs)> = labelled(rows)
         .into_iter()
         .filter_map(|scene| Some((scene, Runs::of(rows, scene, BASE)?)))
         .collect();
@@ -94,14 +108,19 @@ mod tests {
 
     #[test]
     fn the_readme_changes_between_its_markers_only() {
-        let readme = format!("# Title\n{}old\n{}\nmore\n", MARKERS[0], MARKERS[1]);
-        let new = with_table(&readme, &rows()).expect("markers");
+        let between = |[begin, end]: [&str; 2]| format!("{begin}old\n{end}\n");
+        let readme = format!("# Title\n{}and\n{}more\n", between(TEXTS), between(FIGURES));
+        let new = with_figures(&readme, &rows()).expect("markers");
+        assert!(
+            new.contains("The built-in encoder answers 2 of 4 labelled names in 1 scenes"),
+            "{new}"
+        );
         assert!(new.starts_with("# Title\n") && new.ends_with("\nmore\n") && !new.contains("old"));
         assert!(
             new.contains("0.85 (0.80 to 0.90)") && new.contains("2 of 4"),
             "{new}"
         );
-        assert_eq!(with_table(&new, &rows()).expect("markers"), new);
-        assert!(with_table("no marker", &rows()).is_err());
+        assert_eq!(with_figures(&new, &rows()).expect("markers"), new);
+        assert!(with_figures("no marker", &rows()).is_err());
     }
 }

@@ -20,6 +20,9 @@ pub struct Rows {
     pub version: String,
     /// Each row has `scene`, `way`, `seed` and `machine`, and figures.
     pub rows: Vec<Value>,
+    /// Report of `fastlgs-bench clip`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub clip: Option<Value>,
 }
 
 impl Rows {
@@ -32,6 +35,7 @@ impl Rows {
             return Ok(Self {
                 version: VERSION.to_owned(),
                 rows: Vec::new(),
+                clip: None,
             });
         }
         let rows: Self = fs::read_json(file)?;

@@ -1,0 +1,170 @@
+//! The first page of the results: what fails, and all ways against the default one.
+
+use super::figures::{Mean, Runs, given, total_seconds};
+use super::markdown::table;
+use super::plan::{BASE, Page, WAYS, Way};
+use super::rows::Rows;
+use super::stability;
+use super::texts;
+use serde_json::Value;
+use std::fmt::Write as _;
+
+/// Best objects below this IoU are listed as failures.
+const GOOD_IOU: f64 = 0.8;
+/// Disturbances that cost more points than this on some scene are listed as failures.
+const MANY_POINTS: f64 = 10.0;
+/// Disturbances that cost fewer points than this on every scene are listed as harmless.
+const FEW_POINTS: f64 = 2.0;
+
+/// Returns a list of what fails, and of what does not.
+pub fn failures(rows: &Rows) -> String {
+    let mut text = String::new();
+    if let Some(answered) = texts::answered(rows) {
+        let _ = writeln!(text, "- Texts: {answered}.");
+    }
+    let poor: Vec<String> = stability::scenes(rows)
+        .iter()
+        .filter(|(_, best)| best.mean < GOOD_IOU)
+        .map(|(scene, best)| format!("{scene} {:.2}", best.mean))
+        .collect();
+    if !poor.is_empty() {
+        let _ = writeln!(
+            text,
+            "- Scenes whose best objects have a mean IoU below {GOOD_IOU}: {}.",
+            poor.join(", ")
+        );
+    }
+    let losses: Vec<(String, f64)> = stability::disturbances(rows)
+        .into_iter()
+        .filter_map(|(name, changes)| {
+            let means = changes.iter().flatten().map(|change| change.mean);
+            Some((name, means.reduce(f64::min)?))
+        })
+        .collect();
+    let listed = |keep: &dyn Fn(f64) -> bool| {
+        let kept = losses.iter().filter(|(_, loss)| keep(*loss));
+        let named = kept.map(|(name, loss)| format!("{name} ({loss:+.0})"));
+        named.collect::<Vec<_>>().join(", ")
+    };
+    for (about, names) in [
+        (
+            format!("Disturbances that cost more than {MANY_POINTS:.0} points on some scene"),
+            listed(&|loss| loss < -MANY_POINTS),
+        ),
+        (
+            format!("Disturbances that cost less than {FEW_POINTS:.0} points on every scene"),
+            listed(&|loss| loss > -FEW_POINTS),
+        ),
+    ] {
+        if !names.is_empty() {
+            let _ = writeln!(text, "- {about}, with the largest loss: {names}.");
+        }
+    }
+    text
+}
+
+/// Returns the table of all ways of speed, size and the paper, against their reference.
+pub fn changes(rows: &Rows) -> String {
+    let is_listed = |way: &&Way| way.name != BASE && way.pages != [Page::Stability];
+    let lines: Vec<Vec<String>> = WAYS
+        .iter()
+        .filter(is_listed)
+        .filter_map(|way| line(rows, way))
+        .collect();
+    let head = [
+        "way",
+        "scenes",
+        "time",
+        "size",
+        "PSNR, dB",
+        "best object",
+        "text",
+    ];
+    table(&head, &lines)
+}
+
+/// Mean over the scenes of a comparison with the reference, with the range of the scenes.
+fn over_scenes(
+    rows: &Rows,
+    way: &Way,
+    compare: impl Fn(&Value, &Value) -> Option<f64>,
+) -> Option<Mean> {
+    Mean::of(given(rows).into_iter().filter_map(|scene| {
+        let reference = Runs::of(rows, scene, way.reference())?;
+        let runs = Runs::of(rows, scene, way.name)?;
+        Some(runs.against(&reference, &compare)?.mean)
+    }))
+}
+
+fn line(rows: &Rows, way: &Way) -> Option<Vec<String>> {
+    let scenes: Vec<&str> = given(rows)
+        .into_iter()
+        .filter(|scene| Runs::of(rows, scene, way.name).is_some())
+        .collect();
+    if scenes.is_empty() {
+        return None;
+    }
+    let ratio = |of: &dyn Fn(&Value) -> Option<f64>| {
+        over_scenes(rows, way, |row, other| Some(of(row)? / of(other)?))
+            .map_or(String::new(), |mean| format!("x {:.2}", mean.mean))
+    };
+    let difference = |figure: &str, factor: f64, digits: usize| {
+        over_scenes(rows, way, |row, other| {
+            Some(factor * (row[figure].as_f64()? - other[figure].as_f64()?))
+        })
+        .map_or(String::new(), |mean| signed(mean, digits))
+    };
+    Some(vec![
+        way.name.to_owned(),
+        scenes.join(", "),
+        ratio(&total_seconds),
+        ratio(&|row| row["scene_bytes"].as_f64()),
+        difference("psnr", 1.0, 2),
+        difference("oracle_miou", 100.0, 1),
+        difference("miou", 100.0, 1),
+    ])
+}
+
+/// Formats a mean change with the range of the scenes; the mean alone if all are the same.
+fn signed(change: Mean, digits: usize) -> String {
+    let Mean { mean, low, high } = change;
+    let [mean, low, high] = [mean, low, high].map(|v| format!("{v:+.digits$}"));
+    if low == high {
+        mean
+    } else {
+        format!("{mean} ({low} to {high})")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::pages::tests::rows;
+    use super::*;
+
+    #[test]
+    fn ways_are_compared_seed_by_seed() {
+        let text = changes(&rows());
+        // Seed 1 of quick has no counterpart.
+        let standard = text.lines().find(|line| line.contains("standard"));
+        assert_eq!(
+            standard,
+            Some("| standard | fox | x 3.31 | x 1.00 | +0.00 | -10.0 | -5.0 |"),
+            "{text}"
+        );
+    }
+
+    #[test]
+    fn failures_have_the_largest_loss() {
+        let text = failures(&rows());
+        assert!(
+            text.contains(
+                "more than 10 points on some scene, with the largest loss: blur 2 px (-30)"
+            ),
+            "{text}"
+        );
+        assert!(
+            text.contains("twins 0.30") && text.contains("JPEG quality 15 (-1)"),
+            "{text}"
+        );
+    }
+}
