@@ -5,6 +5,7 @@ use fastlgs_core::image_io;
 use image::RgbImage;
 use plotters::coord::Shift;
 use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
 use std::path::Path;
 use std::sync::Once;
 
@@ -205,6 +206,52 @@ fn two_digits(value: f64) -> String {
     format!("{value:.decimals$}")
 }
 
+/// Place of the name of a point, in pixels: both ends, and the middle of its line.
+struct Name {
+    left: i32,
+    right: i32,
+    y: i32,
+}
+
+impl Name {
+    const HEIGHT: i32 = 11;
+    /// Distance from the centre of the point.
+    const GAP: i32 = 7;
+
+    /// Returns the place nearest to a point, at its left or right, that covers no other name and no
+    /// point; beside the point if there is none.
+    fn near(
+        (x, y): (i32, i32),
+        width: i32,
+        at_left: bool,
+        names: &[Self],
+        points: &[(i32, i32)],
+    ) -> Self {
+        let left = if at_left {
+            x - Self::GAP - width
+        } else {
+            x + Self::GAP
+        };
+        let at = |shift: i32| Self {
+            left,
+            right: left + width,
+            y: y + shift,
+        };
+        let shifts = (0..100).map(|k| if k % 2 == 0 { k / 2 } else { -(k + 1) / 2 });
+        let is_free = |place: &Self| {
+            let is_beside = |from: i32, to: i32| to < place.left || from > place.right;
+            let covers_name = |other: &Self| {
+                (other.y - place.y).abs() < Self::HEIGHT && !is_beside(other.left, other.right)
+            };
+            let covers_point = |(x, y): &(i32, i32)| {
+                (y - place.y).abs() < Self::HEIGHT && !is_beside(x - 4, x + 4)
+            };
+            !names.iter().any(covers_name) && !points.iter().any(covers_point)
+        };
+        shifts.map(at).find(is_free).unwrap_or_else(|| at(0))
+    }
+}
+
 /// Returns round numbers of a range for a logarithmic axis.
 fn ticks(left: f64, right: f64) -> Vec<f64> {
     let decades = left.log10().floor() as i32..=right.log10().floor() as i32;
@@ -242,8 +289,8 @@ impl Panels<'_> {
         let (low, high) = span(&mut points().flat_map(|p| [p.range.0, p.range.1]));
         // Differences that seeds make alone do not fill the chart.
         let margin = 0.1 * (high - low) + 0.5 * (MIN_SPAN - (high - low)).max(0.0);
-        // The names need room to the right of their points.
-        let (left, right) = (0.85 * left, 1.6 * right * (right / left).sqrt());
+        let beside = 1.1 * (right / left).powf(0.1);
+        let (left, right) = (left / beside, right * beside);
         let x = (left..right).log_scale();
         let axes = Axes {
             title: &panel.name,
@@ -271,31 +318,35 @@ impl Panels<'_> {
         }))?;
         let mut sorted: Vec<&Point> = points().collect();
         sorted.sort_by(|a, b| b.y.total_cmp(&a.y).then(a.x.total_cmp(&b.x)));
-        // Names keep a distance of a line from names above them that are near.
-        let mut names: Vec<(i32, i32)> = Vec::new();
-        let mut places = Vec::new();
-        for point in &sorted {
-            let (x, mut y) = chart.backend_coord(&(point.x, point.y));
-            let own = y;
-            while names
-                .iter()
-                .any(|(other, line)| (x - other).abs() < 150 && (y - line).abs() < 11)
-            {
-                y += 1;
-            }
-            names.push((x, y));
-            places.push(y - own);
-        }
-        chart.draw_series(sorted.iter().zip(places).map(|(p, shift)| {
-            let style = if p.front {
+        chart.draw_series(sorted.iter().map(|p| {
+            let fill = if p.front {
                 COLOR.filled()
             } else {
                 COLOR.stroke_width(1)
             };
-            EmptyElement::at((p.x, p.y))
-                + Circle::new((0, 0), 4, style)
-                + Text::new(p.name.clone(), (7, shift - 6), (FONT, 11))
+            Circle::new((p.x, p.y), 4, fill)
         }))?;
+        let (columns, lines) = area.get_pixel_range();
+        let centres: Vec<(i32, i32)> = sorted
+            .iter()
+            .map(|p| chart.backend_coord(&(p.x, p.y)))
+            .map(|(x, y)| (x - columns.start, y - lines.start))
+            .collect();
+        let style = (FONT, 11).into_text_style(area);
+        let mut names: Vec<Name> = Vec::new();
+        for (point, centre) in sorted.iter().zip(&centres) {
+            let width = area.estimate_text_size(&point.name, &style)?.0 as i32;
+            let at_left = 2 * centre.0 > columns.len() as i32;
+            let name = Name::near(*centre, width, at_left, &names, &centres);
+            let (x, side) = if at_left {
+                (name.right, HPos::Right)
+            } else {
+                (name.left, HPos::Left)
+            };
+            let style = style.pos(Pos::new(side, VPos::Center));
+            area.draw(&Text::new(point.name.clone(), (x, name.y), style))?;
+            names.push(name);
+        }
         Ok(())
     }
 }
@@ -342,7 +393,7 @@ pub struct HeatMap<'a> {
 
 impl HeatMap<'_> {
     const ROW: i32 = 20;
-    const NAME: i32 = 290;
+    const NAME: i32 = 330;
     const COLUMN: i32 = 92;
     const HEAD: i32 = 64;
 }
@@ -406,6 +457,21 @@ mod tests {
     fn ticks_are_round_numbers_in_the_range() {
         assert_eq!(ticks(60.0, 210.0), [70.0, 100.0, 150.0, 200.0]);
         assert_eq!(ticks(4.0, 12.0), [5.0, 7.0, 10.0]);
+    }
+
+    #[test]
+    fn names_cover_neither_names_nor_points() {
+        let points = [(10, 50), (40, 50), (10, 55)];
+        let first = Name::near(points[0], 20, false, &[], &points);
+        assert_eq!(
+            (first.left, first.right, first.y),
+            (17, 37, 39),
+            "above the second point"
+        );
+        let second = Name::near(points[1], 20, true, &[], &points);
+        assert_eq!((second.left, second.right), (13, 33));
+        let third = Name::near(points[2], 20, false, &[first], &points);
+        assert!(third.y >= 61, "{}", third.y);
     }
 
     #[test]
