@@ -1,4 +1,4 @@
-//! Disturbances of photos, masks and embeddings, for `fastlgs-bench stability`.
+//! Disturbances of photos, masks and embeddings, for `fastlgs-bench all`.
 
 use anyhow::{Context, Result};
 use fastlgs::model_choice;

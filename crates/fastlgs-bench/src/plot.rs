@@ -252,10 +252,15 @@ impl Name {
     }
 }
 
-/// Returns round numbers of a range for a logarithmic axis.
+/// Returns round numbers of a range for a logarithmic axis; powers of ten if it is wide.
 fn ticks(left: f64, right: f64) -> Vec<f64> {
     let decades = left.log10().floor() as i32..=right.log10().floor() as i32;
-    let numbers = decades.flat_map(|k| [1.0, 1.5, 2.0, 3.0, 5.0, 7.0].map(|n| n * 10f64.powi(k)));
+    let digits: &[f64] = if right > 100.0 * left {
+        &[1.0]
+    } else {
+        &[1.0, 1.5, 2.0, 3.0, 5.0, 7.0]
+    };
+    let numbers = decades.flat_map(|k| digits.iter().map(move |n| n * 10f64.powi(k)));
     numbers.filter(|x| (left..=right).contains(x)).collect()
 }
 
@@ -457,6 +462,7 @@ mod tests {
     fn ticks_are_round_numbers_in_the_range() {
         assert_eq!(ticks(60.0, 210.0), [70.0, 100.0, 150.0, 200.0]);
         assert_eq!(ticks(4.0, 12.0), [5.0, 7.0, 10.0]);
+        assert_eq!(ticks(4.0, 1200.0), [10.0, 100.0, 1000.0]);
     }
 
     #[test]

@@ -24,10 +24,26 @@ impl Mean {
         })
     }
 
+    /// Returns the figure in another unit.
+    pub fn times(self, factor: f64) -> Self {
+        let Self { mean, low, high } = self;
+        let [mean, low, high] = [mean, low, high].map(|v| factor * v);
+        Self { mean, low, high }
+    }
+
     /// Formats mean and range; the mean alone if all values are the same.
     pub fn text(self, digits: usize) -> String {
+        self.formatted(|v| format!("{v:.digits$}"))
+    }
+
+    /// The same with signs.
+    pub fn signed(self, digits: usize) -> String {
+        self.formatted(|v| format!("{v:+.digits$}"))
+    }
+
+    fn formatted(self, format: impl Fn(f64) -> String) -> String {
         let Self { mean, low, high } = self;
-        let [mean, low, high] = [mean, low, high].map(|v| format!("{v:.digits$}"));
+        let [mean, low, high] = [mean, low, high].map(format);
         if low == high {
             mean
         } else {
@@ -65,7 +81,7 @@ impl<'a> Runs<'a> {
     }
 
     /// A comparison with the rows of other runs that have the same seed.
-    pub fn against(
+    fn against(
         &self,
         reference: &Self,
         compare: impl Fn(&Value, &Value) -> Option<f64>,
@@ -76,11 +92,16 @@ impl<'a> Runs<'a> {
         }))
     }
 
-    /// Change of a figure against other runs with the same seed, in points.
+    /// Change of a figure against other runs with the same seed.
     pub fn change(&self, figure: &str, reference: &Self) -> Option<Mean> {
         self.against(reference, |row, other| {
-            Some(100.0 * (row[figure].as_f64()? - other[figure].as_f64()?))
+            Some(row[figure].as_f64()? - other[figure].as_f64()?)
         })
+    }
+
+    /// Ratio of a figure to that of other runs with the same seed.
+    pub fn ratio(&self, figure: impl Fn(&Value) -> Option<f64>, reference: &Self) -> Option<Mean> {
+        self.against(reference, |row, other| Some(figure(row)? / figure(other)?))
     }
 }
 

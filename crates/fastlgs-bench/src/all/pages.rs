@@ -60,12 +60,7 @@ pub fn all(rows: &Rows) -> Result<Vec<(String, String)>> {
 }
 
 fn megabytes(runs: &Runs) -> Option<Mean> {
-    let Mean { mean, low, high } = runs.mean("scene_bytes")?;
-    Some(Mean {
-        mean: mean / 1e6,
-        low: low / 1e6,
-        high: high / 1e6,
-    })
+    Some(runs.mean("scene_bytes")?.times(1e-6))
 }
 
 /// Returns a panel for each given scene: the ways of these pages, with their Pareto front.
@@ -141,9 +136,10 @@ fn index(rows: &Rows) -> String {
     let _ = write!(
         text,
         "\n## Make them again\n\nScenes: {scenes}; {} rows in [rows.json](rows.json). One command makes all rows that are missing, and \
-         all pages. The second makes one row again, in a folder of its own:\n\n```sh\nfastlgs-bench all --scenes {} -o docs/results \
+         all pages. The second makes one row again, in another folder:\n\n```sh\nfastlgs-bench all --scenes {} --clip clip -o docs/results \
          --readme README.md --device cpu\nfastlgs-bench all --scenes fox --ways \"blur 2 px\" --seeds 1 -o again --device cpu\n```\n\n\
-         Names of scenes are folders of photos with `labels/` beside them, or kinds of generated scenes.\n",
+         Names of scenes are folders of photos with `labels/` beside them, or kinds of generated scenes. \
+         `clip` is a folder of CLIP embeddings for `fastlgs-bench clip`.\n",
         rows.rows.len(),
         given(rows).join(","),
     );
@@ -253,20 +249,17 @@ fn limits(rows: &Rows) -> String {
     let line = |scene: &str| {
         let limited = Runs::of(rows, scene, BASE)?;
         let free = Runs::of(rows, scene, UNLIMITED)?;
-        let more = free.against(&limited, |row, other| {
-            Some(row["gaussians"].as_f64()? / other["gaussians"].as_f64()?)
-        });
-        let colour = free.against(&limited, |row, other| {
-            Some(row["psnr"].as_f64()? - other["psnr"].as_f64()?)
-        });
+        let more = free.ratio(|row| row["gaussians"].as_f64(), &limited);
+        let colour = free.change("psnr", &limited);
         let objects = free.change("oracle_miou", &limited);
+        let points = objects.map(|change| change.times(100.0));
         let text = |mean: Option<Mean>, digits| mean.map_or(String::new(), |m| m.text(digits));
         Some(vec![
             scene.to_owned(),
             limited.text("gaussians", 0),
             text(more, 2),
             text(colour, 2),
-            text(objects, 1),
+            text(points, 1),
         ])
     };
     let lines: Vec<Vec<String>> = given(rows).into_iter().filter_map(line).collect();

@@ -71,7 +71,7 @@ impl Way {
         }
     }
 
-    /// Whether colour and size alone are worth a row.
+    /// Whether it is measured on scenes without labels too.
     fn needs_no_labels(&self) -> bool {
         self.pages.contains(&Page::Size) && !matches!(self.how, How::Baseline(_))
     }

@@ -15,7 +15,8 @@ pub fn disturbances(rows: &Rows) -> Vec<(String, Vec<Option<Mean>>)> {
     {
         let change = |scene: &&str| {
             let runs = Runs::of(rows, scene, way.name)?;
-            runs.change(figure_of(way), &Runs::of(rows, scene, way.reference())?)
+            let change = runs.change(figure_of(way), &Runs::of(rows, scene, way.reference())?)?;
+            Some(change.times(100.0))
         };
         let changes: Vec<Option<Mean>> = scenes.iter().map(change).collect();
         if changes.iter().any(Option::is_some) {

@@ -83,57 +83,42 @@ pub fn changes(rows: &Rows) -> String {
     table(&head, &lines)
 }
 
-/// Mean over the scenes of a comparison with the reference, with the range of the scenes.
-fn over_scenes(
-    rows: &Rows,
-    way: &Way,
-    compare: impl Fn(&Value, &Value) -> Option<f64>,
-) -> Option<Mean> {
-    Mean::of(given(rows).into_iter().filter_map(|scene| {
-        let reference = Runs::of(rows, scene, way.reference())?;
-        let runs = Runs::of(rows, scene, way.name)?;
-        Some(runs.against(&reference, &compare)?.mean)
-    }))
-}
-
 fn line(rows: &Rows, way: &Way) -> Option<Vec<String>> {
-    let scenes: Vec<&str> = given(rows)
+    let pairs: Vec<(&str, Runs, Runs)> = given(rows)
         .into_iter()
-        .filter(|scene| Runs::of(rows, scene, way.name).is_some())
+        .filter_map(|scene| {
+            let reference = Runs::of(rows, scene, way.reference())?;
+            Some((scene, Runs::of(rows, scene, way.name)?, reference))
+        })
         .collect();
-    if scenes.is_empty() {
+    if pairs.is_empty() {
         return None;
     }
-    let ratio = |of: &dyn Fn(&Value) -> Option<f64>| {
-        over_scenes(rows, way, |row, other| Some(of(row)? / of(other)?))
+    // Mean over the scenes, with their range.
+    let over_scenes = |compare: &dyn Fn(&Runs, &Runs) -> Option<Mean>| {
+        let means = pairs
+            .iter()
+            .filter_map(|(_, runs, reference)| compare(runs, reference));
+        Mean::of(means.map(|mean| mean.mean))
+    };
+    let ratio = |figure: &dyn Fn(&Value) -> Option<f64>| {
+        over_scenes(&|runs, reference| runs.ratio(figure, reference))
             .map_or(String::new(), |mean| format!("x {:.2}", mean.mean))
     };
-    let difference = |figure: &str, factor: f64, digits: usize| {
-        over_scenes(rows, way, |row, other| {
-            Some(factor * (row[figure].as_f64()? - other[figure].as_f64()?))
-        })
-        .map_or(String::new(), |mean| signed(mean, digits))
+    let change = |figure: &str, factor: f64, digits: usize| {
+        over_scenes(&|runs, reference| runs.change(figure, reference))
+            .map_or(String::new(), |mean| mean.times(factor).signed(digits))
     };
+    let scenes: Vec<&str> = pairs.iter().map(|(scene, ..)| *scene).collect();
     Some(vec![
         way.name.to_owned(),
         scenes.join(", "),
         ratio(&total_seconds),
         ratio(&|row| row["scene_bytes"].as_f64()),
-        difference("psnr", 1.0, 2),
-        difference("oracle_miou", 100.0, 1),
-        difference("miou", 100.0, 1),
+        change("psnr", 1.0, 2),
+        change("oracle_miou", 100.0, 1),
+        change("miou", 100.0, 1),
     ])
-}
-
-/// Formats a mean change with the range of the scenes; the mean alone if all are the same.
-fn signed(change: Mean, digits: usize) -> String {
-    let Mean { mean, low, high } = change;
-    let [mean, low, high] = [mean, low, high].map(|v| format!("{v:+.digits$}"));
-    if low == high {
-        mean
-    } else {
-        format!("{mean} ({low} to {high})")
-    }
 }
 
 #[cfg(test)]

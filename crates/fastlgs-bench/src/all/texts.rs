@@ -2,7 +2,7 @@
 
 use super::figures::{Mean, Runs, labelled};
 use super::markdown::{stamp, table};
-use super::plan::{BASE, WAYS};
+use super::plan::{BASE, WAYS, Way};
 use super::rows::Rows;
 use fastlgs_synth::Kind;
 use serde_json::Value;
@@ -60,48 +60,58 @@ pub fn with_clip(rows: &Rows) -> Option<String> {
     ))
 }
 
-pub fn page(rows: &Rows) -> String {
-    let mut by_scene: Vec<(f64, Vec<String>)> = Vec::new();
+/// Formats a count, with its range if the seeds differ.
+fn count(runs: &Runs, figure: &str) -> String {
+    runs.text(figure, 1).replace(".0", "")
+}
+
+/// Returns the lines of the scenes, worst first.
+fn by_scene(rows: &Rows) -> Vec<Vec<String>> {
+    let mut lines: Vec<(f64, Vec<String>)> = Vec::new();
     for scene in labelled(rows) {
         let Some(runs) = Runs::of(rows, scene, BASE) else {
             continue;
         };
         let right = runs.mean("right").map_or(0.0, |mean| mean.mean);
         let labels = runs.mean("labels").map_or(1.0, |mean| mean.mean);
-        by_scene.push((
-            right / labels,
-            vec![
-                scene.to_owned(),
-                runs.0.len().to_string(),
-                format!("{labels:.0}"),
-                runs.text("right", 1).replace(".0", ""),
-                runs.text("miou", 2),
-                runs.text("oracle_miou", 2),
-                runs.text("absent_rejected", 1).replace(".0", ""),
-            ],
-        ));
+        let line = vec![
+            scene.to_owned(),
+            runs.0.len().to_string(),
+            format!("{labels:.0}"),
+            count(&runs, "right"),
+            runs.text("miou", 2),
+            runs.text("oracle_miou", 2),
+            count(&runs, "absent_rejected"),
+        ];
+        lines.push((right / labels, line));
     }
-    by_scene.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let by_scene: Vec<Vec<String>> = by_scene.into_iter().map(|line| line.1).collect();
-    let mut by_way = Vec::new();
-    for scene in labelled(rows) {
-        let is_large = |runs: &Runs| runs.mean("labels").is_some_and(|n| n.mean >= MIN_LABELS);
-        if !Runs::of(rows, scene, BASE).is_some_and(|runs| is_large(&runs)) {
-            continue;
-        }
-        for way in WAYS {
-            let Some(runs) = Runs::of(rows, scene, way.name) else {
-                continue;
-            };
-            by_way.push(vec![
-                scene.to_owned(),
-                way.name.to_owned(),
-                runs.0.len().to_string(),
-                runs.text("right", 1).replace(".0", ""),
-                runs.text("miou", 3),
-            ]);
-        }
-    }
+    lines.sort_by(|a, b| a.0.total_cmp(&b.0));
+    lines.into_iter().map(|line| line.1).collect()
+}
+
+/// Returns the lines of all ways on the scenes with many labels.
+fn by_way(rows: &Rows) -> Vec<Vec<String>> {
+    let has_many = |scene: &&str| {
+        let labels = Runs::of(rows, scene, BASE).and_then(|runs| runs.mean("labels"));
+        labels.is_some_and(|labels| labels.mean >= MIN_LABELS)
+    };
+    let line = |scene: &str, way: &Way| {
+        let runs = Runs::of(rows, scene, way.name)?;
+        Some(vec![
+            scene.to_owned(),
+            way.name.to_owned(),
+            runs.0.len().to_string(),
+            count(&runs, "right"),
+            runs.text("miou", 3),
+        ])
+    };
+    let scenes = labelled(rows).into_iter().filter(has_many);
+    scenes
+        .flat_map(|scene| WAYS.iter().filter_map(move |way| line(scene, way)))
+        .collect()
+}
+
+pub fn page(rows: &Rows) -> String {
     let mut text = format!(
         "# Answers to texts\n\n{}\nThe built-in encoder has 80 everyday classes, 1,000 other classes and a sentence encoder. *Labels*: \
          names of objects in held-out views, once for each view. *Right*: labels whose answer has an IoU of a half \
@@ -119,9 +129,10 @@ pub fn page(rows: &Rows) -> String {
                 "best object",
                 "refused"
             ],
-            &by_scene
+            &by_scene(rows)
         )
     );
+    let by_way = by_way(rows);
     if !by_way.is_empty() {
         let _ = write!(
             text,
