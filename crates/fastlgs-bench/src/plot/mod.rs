@@ -1,0 +1,181 @@
+//! Writes charts as SVG and PNG.
+
+mod heat_map;
+mod lines;
+mod panels;
+
+pub use heat_map::{Cell, HeatMap};
+pub use lines::{Line, Lines};
+pub use panels::{Panel, Panels, Point};
+
+use anyhow::{Context, Result, anyhow};
+use fastlgs_core::image_io;
+use image::RgbImage;
+use plotters::coord::Shift;
+use plotters::prelude::*;
+use std::path::Path;
+use std::sync::Once;
+
+/// Title of a chart and labels of its axes.
+#[derive(Clone, Copy)]
+pub struct Axes<'a> {
+    pub title: &'a str,
+    pub x: &'a str,
+    pub y: &'a str,
+}
+
+/// A drawing for any backend of plotters.
+pub trait Drawing {
+    /// Width and height in pixels.
+    fn size(&self) -> (u32, u32) {
+        (860, 560)
+    }
+
+    fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>) -> Drawn
+    where
+        DB::ErrorType: 'static;
+}
+
+/// Result of a drawing; the error is that of the backend.
+type Drawn = Result<(), Box<dyn std::error::Error>>;
+
+/// The font of all charts.
+const FONT: &str = "sans-serif";
+
+fn register_font() {
+    static FONTS: Once = Once::new();
+    FONTS.call_once(|| {
+        // Fails only for a damaged font. This font is part of the program.
+        let _ = plotters::style::register_font(
+            FONT,
+            FontStyle::Normal,
+            epaint_default_fonts::UBUNTU_LIGHT,
+        );
+    });
+}
+
+/// Returns a drawing as SVG.
+///
+/// # Errors
+/// The drawing fails.
+pub fn svg(drawing: &impl Drawing) -> Result<String> {
+    register_font();
+    let mut svg = String::new();
+    on_white(SVGBackend::with_string(&mut svg, drawing.size()), drawing).map_err(failed)?;
+    Ok(svg)
+}
+
+fn failed(error: Box<dyn std::error::Error>) -> anyhow::Error {
+    anyhow!("drawing a chart failed: {error}")
+}
+
+/// Writes `NAME.svg` and `NAME.png` into `folder`, atomically.
+///
+/// # Errors
+/// The drawing fails, or a file cannot be written.
+pub fn save(folder: &Path, name: &str, drawing: &impl Drawing) -> Result<()> {
+    let (width, height) = drawing.size();
+    let svg = svg(drawing)?;
+    fastlgs_core::fs::write_atomic(&folder.join(format!("{name}.svg")), |file| {
+        std::io::Write::write_all(file, svg.as_bytes())
+    })?;
+    let mut pixels = vec![0; (3 * width * height) as usize];
+    let canvas = BitMapBackend::with_buffer(&mut pixels, (width, height));
+    on_white(canvas, drawing).map_err(failed)?;
+    let picture = RgbImage::from_raw(width, height, pixels).context("a chart's pixels")?;
+    Ok(image_io::save_png(
+        &folder.join(format!("{name}.png")),
+        picture,
+    )?)
+}
+
+fn on_white<DB: DrawingBackend>(backend: DB, drawing: &impl Drawing) -> Drawn
+where
+    DB::ErrorType: 'static,
+{
+    let area = backend.into_drawing_area();
+    area.fill(&WHITE)?;
+    drawing.draw(&area)?;
+    Ok(area.present()?)
+}
+
+/// Starts a chart with a title and margins for the axes.
+fn titled<'a, 'b, DB: DrawingBackend>(
+    area: &'a DrawingArea<DB, Shift>,
+    axes: &Axes,
+) -> ChartBuilder<'a, 'b, DB> {
+    let mut chart = ChartBuilder::on(area);
+    chart
+        .caption(axes.title, (FONT, 20))
+        .margin(16)
+        .x_label_area_size(44)
+        .y_label_area_size(60);
+    chart
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn charts_are_written_in_both_forms() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let point = |x, y: f64| Point {
+            name: "spot".to_owned(),
+            x,
+            y,
+            range: (y, y),
+            front: true,
+        };
+        let axes = Axes {
+            title: "title",
+            x: "x",
+            y: "y",
+        };
+        let panel = |points| Panel {
+            name: "panel".to_owned(),
+            points,
+        };
+        let panels = vec![
+            panel(vec![point(1.0, 0.5), point(10.0, f64::NAN)]),
+            panel(Vec::new()),
+        ];
+        let drawn = svg(&Panels { axes, panels }).expect("drawn");
+        assert!(drawn.contains("spot") && drawn.contains("panel") && drawn.contains("title"));
+        svg(&Panels {
+            axes,
+            panels: Vec::new(),
+        })
+        .expect("drawn");
+        let rows = [(
+            "row".to_owned(),
+            vec![Cell {
+                text: "-3".to_owned(),
+                shade: Some(-1.0),
+            }],
+        )];
+        save(
+            folder.path(),
+            "heat",
+            &HeatMap {
+                title: "heat",
+                columns: &["a"],
+                rows: &rows,
+            },
+        )
+        .expect("drawn");
+        let svg = std::fs::read_to_string(folder.path().join("heat.svg")).expect("the SVG");
+        assert!(svg.contains("row") && svg.contains("heat"));
+        let picture = image_io::load_rgb(&folder.path().join("heat.png")).expect("the PNG");
+        let red = picture
+            .get_pixel(HeatMap::NAME as u32 + 80, HeatMap::HEAD as u32 + 10)
+            .0;
+        assert!(red[0] > 200 && red[1] < 100, "{red:?}");
+        assert!(
+            picture
+                .pixels()
+                .any(|p| p.0 == [0; 3] || p.0.iter().all(|v| *v < 100)),
+            "the chart has text"
+        );
+    }
+}
