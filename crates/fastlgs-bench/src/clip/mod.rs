@@ -5,15 +5,17 @@
 //! `ROOM.views.npy` (number of views of each object). Pairs of pictures and captions may lie beside
 //! them as `NAME.images.npy` and `NAME.texts.npy`.
 
-use anyhow::{Context, Result, bail};
+mod features;
+
+use anyhow::{Result, bail};
 use fastlgs::calibrations::Calibrations;
-use fastlgs_core::{fs, metrics, npy};
+use fastlgs_core::metrics;
 use fastlgs_grid::calibration::{Best, Calibration, Samples};
 use fastlgs_grid::query::{self, QueryConfig};
 use fastlgs_grid::relevancy::TextQuery;
-use fastlgs_grid::{Grid, Object, evidence};
-use glam::Vec3;
-use serde::{Deserialize, Serialize};
+use fastlgs_grid::{Object, evidence};
+use features::{Names, Room, embeddings, load_rooms, stems};
+use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -81,28 +83,6 @@ pub struct Report {
     canonical_slope: f64,
     rooms: Vec<RoomRow>,
     pairs: Vec<PairRow>,
-}
-
-/// Groups of names in `texts.json`.
-#[derive(Deserialize)]
-struct Groups {
-    texts: Vec<String>,
-    canonical: Vec<String>,
-    absent: Vec<String>,
-    present: Vec<String>,
-    furniture: Vec<String>,
-}
-
-/// Names with their embeddings.
-struct Names {
-    groups: Groups,
-    rows: Vec<Vec<f32>>,
-}
-
-/// A room: its objects with one embedding each.
-struct Room {
-    name: String,
-    grid: Grid,
 }
 
 /// Accepted shares of absent names in the table.
@@ -226,145 +206,7 @@ fn share_above(values: &[f64], threshold: f64) -> f64 {
     values.iter().filter(|v| **v > threshold).count() as f64 / values.len() as f64
 }
 
-/// Reads a table of embeddings, L2-normalised.
-fn embeddings(path: &Path) -> Result<Vec<Vec<f32>>> {
-    let table = npy::read(path)?;
-    let &[rows, length] = &table.shape[..] else {
-        bail!(
-            "{}: a table of embeddings has two dimensions, this one has {}",
-            path.display(),
-            table.shape.len()
-        );
-    };
-    if rows == 0 || length == 0 {
-        bail!(
-            "{}: it holds no embeddings; save one row for each object or text",
-            path.display()
-        );
-    }
-    let unit = |row: &[f64]| -> Result<Vec<f32>> {
-        let norm = row.iter().map(|v| v * v).sum::<f64>().sqrt();
-        if !(norm > 0.0 && norm.is_finite()) {
-            bail!("{}: a row is zero or not finite; remove it", path.display());
-        }
-        Ok(row.iter().map(|v| (v / norm) as f32).collect())
-    };
-    table.values.chunks_exact(length).map(unit).collect()
-}
-
-/// Reads all rooms, in order of their names.
-fn load_rooms(folder: &Path, length: usize) -> Result<Vec<Room>> {
-    let mut rooms = Vec::new();
-    for name in stems(folder, ".views.npy")? {
-        let path = folder.join(format!("{name}.npy"));
-        let rows = embeddings(&path)?;
-        if rows[0].len() != length {
-            bail!(
-                "{}: its embeddings have {} dimensions, but those of texts.npy have {length}; use texts of the same model",
-                path.display(),
-                rows[0].len()
-            );
-        }
-        let views = npy::read(&folder.join(format!("{name}.views.npy")))?.values;
-        if views.len() != rows.len() {
-            bail!(
-                "{}: it has {} objects, but {name}.views.npy has {}; save both from the same objects",
-                path.display(),
-                rows.len(),
-                views.len()
-            );
-        }
-        let objects = (1..)
-            .zip(rows)
-            .zip(&views)
-            .map(|((id, row), views)| Object {
-                id,
-                parent: 0,
-                support: 1.0,
-                code: Vec3::ZERO,
-                embeddings: vec![row],
-                areas: vec![1.0],
-                views: *views as usize,
-                detected: None,
-            });
-        let grid = Grid {
-            objects: objects.collect(),
-            ..Grid::default()
-        };
-        rooms.push(Room { name, grid });
-    }
-    if rooms.is_empty() {
-        bail!(
-            "{}: it holds no room; a room is ROOM.npy with ROOM.views.npy",
-            folder.display()
-        );
-    }
-    Ok(rooms)
-}
-
-/// Returns the names of the files in a folder that end with `ending`, without it, sorted.
-fn stems(folder: &Path, ending: &str) -> Result<Vec<String>> {
-    let entries = std::fs::read_dir(folder)
-        .with_context(|| format!("{}: the folder cannot be read", folder.display()))?;
-    let mut names = Vec::new();
-    for entry in entries {
-        let name = entry?.file_name().to_string_lossy().into_owned();
-        names.extend(name.strip_suffix(ending).map(str::to_owned));
-    }
-    names.sort();
-    Ok(names)
-}
-
 impl Names {
-    fn load(folder: &Path) -> Result<Self> {
-        let path = folder.join("texts.json");
-        let groups: Groups = fs::read_json(&path)?;
-        let rows = embeddings(&folder.join("texts.npy"))?;
-        if rows.len() != groups.texts.len() {
-            bail!(
-                "{}: it names {} texts, but texts.npy has {} rows; save one row for each text",
-                path.display(),
-                groups.texts.len(),
-                rows.len()
-            );
-        }
-        let lists = [
-            &groups.canonical,
-            &groups.absent,
-            &groups.present,
-            &groups.furniture,
-        ];
-        if let Some(unknown) = lists
-            .into_iter()
-            .flatten()
-            .find(|name| !groups.texts.contains(name))
-        {
-            bail!(
-                "{}: '{unknown}' is in a group but not in 'texts'; add it, with its row in texts.npy",
-                path.display()
-            );
-        }
-        if lists.iter().any(|list| list.is_empty()) {
-            bail!(
-                "{}: each of 'canonical', 'absent', 'present' and 'furniture' needs a name",
-                path.display()
-            );
-        }
-        Ok(Self { groups, rows })
-    }
-
-    fn row(&self, name: &str) -> Vec<f32> {
-        let place = self.groups.texts.iter().position(|text| text == name);
-        self.rows[place.expect("checked by load")].clone()
-    }
-
-    fn query(&self, name: &str, calibration: Calibration) -> TextQuery {
-        TextQuery {
-            canonical: self.groups.canonical.iter().map(|c| self.row(c)).collect(),
-            ..TextQuery::new(vec![self.row(name)], calibration)
-        }
-    }
-
     /// Returns the score of the best object of a room.
     fn score(&self, room: &Room, name: &str, calibration: Calibration) -> f64 {
         f64::from(query::best_score(&query::rank(
