@@ -3,26 +3,24 @@
 //! A field gives each Gaussian a vector by lifting. The vectors are rendered three numbers at a
 //! time, and each pixel is classified on its own.
 
+mod vectors;
+
 use crate::autoencoder::Autoencoder;
-use anyhow::{Context, Result, bail};
-use fastlgs::scene::mean_features;
+use anyhow::{Context, Result};
 use fastlgs::{Run, Scene, eval, model_choice};
 use fastlgs_core::id_weights::{IdWeights, pack, unpack};
 use fastlgs_core::labels::{self, LabelledView};
 use fastlgs_core::rng::Rng;
-use fastlgs_core::{Camera, Gaussians, LabelMap, Level, metrics};
+use fastlgs_core::{Camera, LabelMap, Level, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
 use fastlgs_grid::query::{self, QueryConfig};
 use fastlgs_grid::relevancy::TextQuery;
-use fastlgs_raster::density::State;
-use fastlgs_raster::{CpuEngine, Engine};
 use fastlgs_vision::Encoder;
-use glam::Vec3;
-use ndarray::{Array2, Axis};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use vectors::{Labelled, Vectors, lifted, normalised, rendered, rows};
 
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs-bench baseline scenes/fox --method raw --device cpu")]
@@ -40,17 +38,11 @@ pub struct Args {
     method: String,
 }
 
-/// Largest size of the vectors of all Gaussians, in bytes.
-const MAX_VECTOR_BYTES: usize = 4 << 30;
-
 /// Relevancy threshold. From 0.5 on, a pixel is closer to the text than to every canonical phrase.
 const RELEVANCY_THRESHOLD: f32 = 0.5;
 
 /// Sides of LERF's tiles, as fractions of the photo's shorter side.
 const TILE_SIDES: [f32; 3] = [0.5, 0.25, 0.125];
-
-/// One row per Gaussian, pixel or object.
-type Vectors = Array2<f32>;
 
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let mut scene = Scene::open(&args.scene, run.device)?;
@@ -373,9 +365,6 @@ fn lattice_codes(count: usize, dimension: u32, seed: u64) -> Vectors {
     })
 }
 
-/// A label map with the vectors of its labels.
-type Labelled = (LabelMap, Vec<(u16, Vec<f32>)>);
-
 /// Embeds the masks of a label map. Labels whose embedding is zero are left out.
 fn embedded(
     scene: &Scene,
@@ -393,111 +382,6 @@ fn embedded(
         own.map(|(k, e)| (k as u16 + 1, model_choice::for_texts(scene.manifest(), e)))
             .collect(),
     ))
-}
-
-fn rows(vectors: &[&Vec<f32>]) -> Result<Vectors> {
-    let width = vectors.first().map_or(0, |v| v.len());
-    Ok(Vectors::from_shape_vec(
-        (vectors.len(), width),
-        vectors.iter().flat_map(|v| v.iter().copied()).collect(),
-    )?)
-}
-
-/// Returns the mean vector of each Gaussian over all training views, weighted by blending weights.
-/// `labelled_view` returns the label map of a view and the vectors of its labels.
-///
-/// # Errors
-/// The vectors need more than 4 GiB.
-fn lifted(
-    scene: &Scene,
-    labelled_view: impl Fn(usize, &Camera) -> Result<Labelled>,
-) -> Result<Vectors> {
-    let mut sums = Vectors::zeros((0, 0));
-    let mut weights = vec![0.0f32; scene.gaussians().len()];
-    let training = scene.manifest().training(scene.cameras());
-    let mut engine = CpuEngine::new();
-    engine.set_state(&State::of(scene.gaussians()))?;
-    for (view, camera) in training.iter().enumerate() {
-        let (map, vectors) = labelled_view(view, camera)?;
-        let width = vectors.first().map_or(sums.ncols(), |v| v.1.len());
-        if sums.is_empty() {
-            let bytes = 4 * width * scene.gaussians().len();
-            if bytes > MAX_VECTOR_BYTES {
-                bail!(
-                    "vectors of {width} numbers for {} Gaussians need {} MB, but the limit is {} MB; use a smaller scene",
-                    scene.gaussians().len(),
-                    bytes >> 20,
-                    MAX_VECTOR_BYTES >> 20
-                );
-            }
-            sums = Vectors::zeros((scene.gaussians().len(), width));
-        }
-        let mut place = vec![None; usize::from(map.max()) + 1];
-        for (k, (label, _)) in vectors.iter().enumerate() {
-            if let Some(place) = place.get_mut(usize::from(*label)) {
-                *place = Some(k);
-            }
-        }
-        for vote in engine.votes(scene.view(camera), &map)? {
-            if let Some(k) = place[usize::from(vote.label)] {
-                let mut row = sums.row_mut(vote.gaussian as usize);
-                row.iter_mut()
-                    .zip(&vectors[k].1)
-                    .for_each(|(sum, v)| *sum += vote.weight * v);
-                weights[vote.gaussian as usize] += vote.weight;
-            }
-        }
-    }
-    sums.rows_mut()
-        .into_iter()
-        .zip(weights)
-        .filter(|(_, w)| *w > 0.0)
-        .for_each(|(mut row, w)| row /= w);
-    Ok(sums)
-}
-
-/// Renders the vectors into a view, three numbers per pass. Returns one row per pixel.
-fn rendered(scene: &mut Scene, camera: &Camera, vectors: &Vectors) -> Result<Vectors> {
-    let (pixels, width) = ((camera.width * camera.height) as usize, vectors.ncols());
-    let mut out = Vectors::zeros((pixels, width));
-    let original = scene.gaussians().clone();
-    for first in (0..width).step_by(3) {
-        let at =
-            |row: ndarray::ArrayView1<f32>, k: usize| row.get(first + k).copied().unwrap_or(0.0);
-        let features = vectors
-            .rows()
-            .into_iter()
-            .map(|row| Vec3::new(at(row, 0), at(row, 1), at(row, 2)))
-            .collect();
-        scene.set_gaussians(Gaussians {
-            features,
-            ..original.clone()
-        })?;
-        let frame = scene.render_feature(camera)?;
-        for (k, channel) in mean_features(&frame)
-            .into_iter()
-            .enumerate()
-            .take(width - first)
-        {
-            out.column_mut(first + k)
-                .iter_mut()
-                .zip(channel)
-                .for_each(|(o, v)| *o = v);
-        }
-    }
-    scene.set_gaussians(original)?;
-    Ok(out)
-}
-
-/// Scales all rows to length 1. Rows of length 0 stay as they are.
-fn normalised(mut vectors: Vectors) -> Vectors {
-    for mut row in vectors.axis_iter_mut(Axis(0)) {
-        let length = row.dot(&row).sqrt();
-        if length > 1e-6 {
-            row /= length;
-        }
-    }
-    vectors
 }
 
 /// Returns the relevancy of each pixel: the maximum over all layers.
