@@ -38,7 +38,7 @@ impl Mean {
 
     /// The same with signs.
     pub fn signed(self, digits: usize) -> String {
-        self.formatted(|v| format!("{v:+.digits$}"))
+        self.formatted(|v| signed(v, digits))
     }
 
     fn formatted(self, format: impl Fn(f64) -> String) -> String {
@@ -105,6 +105,16 @@ impl<'a> Runs<'a> {
     }
 }
 
+/// Formats a number with its sign; without one if it is rounded to zero.
+pub fn signed(value: f64, digits: usize) -> String {
+    let text = format!("{value:+.digits$}");
+    if text.contains(|c| matches!(c, '1'..='9')) {
+        text
+    } else {
+        text[1..].to_owned()
+    }
+}
+
 /// Seconds of all stages of a row.
 pub fn total_seconds(row: &Value) -> Option<f64> {
     let stages = row["seconds"].as_object()?.values();
@@ -133,4 +143,15 @@ pub fn labelled(rows: &Rows) -> Vec<&str> {
         Runs::of(rows, scene, BASE).is_some_and(|runs| runs.mean("oracle_miou").is_some())
     };
     given(rows).into_iter().filter(has_labels).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn zero_has_no_sign() {
+        let texts = [-0.04, 0.0, -10.0, 0.3].map(|value| signed(value, 1));
+        assert_eq!(texts, ["0.0", "0.0", "-10.0", "+0.3"]);
+    }
 }

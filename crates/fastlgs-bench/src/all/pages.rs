@@ -197,7 +197,8 @@ fn speed(rows: &Rows) -> String {
     format!(
         "# Speed against accuracy\n\n{}\n{HOW_TO_READ}*front*: no other way is as fast and as accurate. Fields \
          without objects (*mean embeddings*, *like LangSplat*, *like LERF*) are built after the papers' ideas; their best \
-         object is the best threshold for each label.\n\n![accuracy against seconds](speed.svg)\n\n\
+         object is the best threshold for each label. PSNR of *side 240* and *side 720* is that of photos of this side; with \
+         photos missing, it is that of the labelled views alone.\n\n![accuracy against seconds](speed.svg)\n\n\
          ![accuracy against milliseconds of a query](query.svg)\n\n{}",
         stamp(rows),
         table(&head, &lines)

@@ -1,6 +1,6 @@
 //! The page of disturbed inputs and difficult scenes.
 
-use super::figures::{Mean, Runs, distinct, labelled};
+use super::figures::{Mean, Runs, distinct, labelled, signed};
 use super::markdown::{HOW_TO_READ, stamp, table};
 use super::plan::{BASE, How, Page, UNCHANGED, Way, on};
 use super::rows::Rows;
@@ -65,7 +65,7 @@ const FULL_COLOUR: f64 = 20.0;
 
 fn cell(change: Option<Mean>) -> Cell {
     Cell {
-        text: change.map_or(String::new(), |c| format!("{:+.1}", c.mean)),
+        text: change.map_or(String::new(), |c| signed(c.mean, 1)),
         shade: change.map(|c| c.mean / FULL_COLOUR),
     }
 }
@@ -76,7 +76,7 @@ pub fn page(rows: &Rows) -> String {
     let line = |(name, changes): &(String, Vec<Option<Mean>>)| {
         let cells = changes
             .iter()
-            .map(|c| c.map_or(String::new(), |c| c.text(1)));
+            .map(|c| c.map_or(String::new(), |c| c.signed(1)));
         std::iter::once(name.clone()).chain(cells).collect()
     };
     let head: Vec<&str> = std::iter::once("disturbance").chain(scenes).collect();

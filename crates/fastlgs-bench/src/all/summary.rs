@@ -1,6 +1,6 @@
 //! The first page of the results: what fails, and all ways against the default one.
 
-use super::figures::{Mean, Runs, given, total_seconds};
+use super::figures::{Mean, Runs, given, signed, total_seconds};
 use super::markdown::table;
 use super::plan::{BASE, Page, WAYS, Way};
 use super::rows::Rows;
@@ -43,7 +43,7 @@ pub fn failures(rows: &Rows) -> String {
         .collect();
     let listed = |keep: &dyn Fn(f64) -> bool| {
         let kept = losses.iter().filter(|(_, loss)| keep(*loss));
-        let named = kept.map(|(name, loss)| format!("{name} ({loss:+.0})"));
+        let named = kept.map(|(name, loss)| format!("{name} ({})", signed(*loss, 0)));
         named.collect::<Vec<_>>().join(", ")
     };
     for (about, names) in [
@@ -133,7 +133,7 @@ mod tests {
         let standard = text.lines().find(|line| line.contains("standard"));
         assert_eq!(
             standard,
-            Some("| standard | fox | x 3.31 | x 1.00 | +0.00 | -10.0 | -5.0 |"),
+            Some("| standard | fox | x 3.31 | x 1.00 | 0.00 | -10.0 | -5.0 |"),
             "{text}"
         );
     }

@@ -46,14 +46,14 @@ impl Name {
     /// Distance from the centre of the point.
     const GAP: i32 = 7;
 
-    /// Returns the place nearest to a point, at its left or right, that covers no other name and no
-    /// point; beside the point if there is none.
+    /// Returns the place nearest to a point, at its left or right, that covers no other name and
+    /// none of the pixels that are `taken`; beside the point if there is none.
     fn near(
         (x, y): (i32, i32),
         width: i32,
         at_left: bool,
         names: &[Self],
-        points: &[(i32, i32)],
+        taken: &[(i32, i32)],
     ) -> Self {
         let left = if at_left {
             x - Self::GAP - width
@@ -71,10 +71,10 @@ impl Name {
             let covers_name = |other: &Self| {
                 (other.y - place.y).abs() < Self::HEIGHT && !is_beside(other.left, other.right)
             };
-            let covers_point = |(x, y): &(i32, i32)| {
+            let covers_pixel = |(x, y): &(i32, i32)| {
                 (y - place.y).abs() < Self::HEIGHT && !is_beside(x - 4, x + 4)
             };
-            !names.iter().any(covers_name) && !points.iter().any(covers_point)
+            !names.iter().any(covers_name) && !taken.iter().any(covers_pixel)
         };
         shifts.map(at).find(is_free).unwrap_or_else(|| at(0))
     }
@@ -144,7 +144,7 @@ impl Panels<'_> {
             .draw()?;
         let mut front: Vec<(f64, f64)> = points().filter(|p| p.front).map(|p| (p.x, p.y)).collect();
         front.sort_by(|a, b| a.0.total_cmp(&b.0));
-        chart.draw_series(LineSeries::new(front, COLOR.stroke_width(1)))?;
+        chart.draw_series(LineSeries::new(front.clone(), COLOR.stroke_width(1)))?;
         chart.draw_series(points().map(|p| {
             let ends = vec![(p.x, p.range.0), (p.x, p.range.1)];
             PathElement::new(ends, BLACK.mix(0.4).stroke_width(1))
@@ -160,37 +160,57 @@ impl Panels<'_> {
             Circle::new((p.x, p.y), 4, fill)
         }))?;
         let (columns, lines) = area.get_pixel_range();
-        let centres: Vec<(i32, i32)> = sorted
+        let pixel = |x: f64, y: f64| {
+            let (x, y) = chart.backend_coord(&(x, y));
+            (x - columns.start, y - lines.start)
+        };
+        let names: Vec<(&str, (i32, i32))> = sorted
             .iter()
-            .map(|p| chart.backend_coord(&(p.x, p.y)))
-            .map(|(x, y)| (x - columns.start, y - lines.start))
+            .map(|p| (p.name.as_str(), pixel(p.x, p.y)))
             .collect();
-        let names = sorted.iter().map(|p| p.name.as_str());
-        draw_names(area, &names.zip(centres).collect::<Vec<_>>())
+        let front: Vec<(i32, i32)> = front.iter().map(|p| pixel(p.0, p.1)).collect();
+        draw_names(area, &names, &front)
     }
 }
 
-/// Draws the names of points beside their centres, given in pixels of `area`.
+/// Returns pixels of a line, two apart or less.
+fn pixels_of(line: &[(i32, i32)]) -> impl Iterator<Item = (i32, i32)> {
+    line.windows(2).flat_map(|ends| {
+        let (from, to) = (ends[0], ends[1]);
+        let steps = ((to.0 - from.0).abs().max((to.1 - from.1).abs()) / 2).max(1);
+        let at = move |from: i32, to: i32, k: i32| from + (to - from) * k / steps;
+        (0..=steps).map(move |k| (at(from.0, to.0, k), at(from.1, to.1, k)))
+    })
+}
+
+/// Draws the names of points beside their centres, given in pixels of `area`, and not on the front.
+/// Names that are not right beside their point are joined with it.
 fn draw_names<DB: DrawingBackend>(
     area: &DrawingArea<DB, Shift>,
     points: &[(&str, (i32, i32))],
+    front: &[(i32, i32)],
 ) -> Drawn
 where
     DB::ErrorType: 'static,
 {
-    let centres: Vec<(i32, i32)> = points.iter().map(|point| point.1).collect();
+    let centres = points.iter().map(|point| point.1);
+    let taken: Vec<(i32, i32)> = centres.chain(pixels_of(front)).collect();
     let width_of_area = area.dim_in_pixel().0 as i32;
     let style = (FONT, 11).into_text_style(area);
     let mut names: Vec<Name> = Vec::new();
     for (text, centre) in points {
         let width = area.estimate_text_size(text, &style)?.0 as i32;
         let at_left = 2 * centre.0 > width_of_area;
-        let name = Name::near(*centre, width, at_left, &names, &centres);
+        let name = Name::near(*centre, width, at_left, &names, &taken);
         let (x, side) = if at_left {
             (name.right, HPos::Right)
         } else {
             (name.left, HPos::Left)
         };
+        if (name.y - centre.1).abs() > Name::HEIGHT {
+            let joint = vec![*centre, (x, name.y)];
+            area.draw(&PathElement::new(joint, BLACK.mix(0.3).stroke_width(1)))?;
+        }
         let style = style.pos(Pos::new(side, VPos::Center));
         area.draw(&Text::new(*text, (x, name.y), style))?;
         names.push(name);
@@ -246,6 +266,15 @@ mod tests {
         assert_eq!((second.left, second.right), (13, 33));
         let third = Name::near(points[2], 20, false, &[first], &points);
         assert!(third.y >= 61, "{}", third.y);
+    }
+
+    #[test]
+    fn lines_have_no_gaps() {
+        let pixels: Vec<(i32, i32)> = pixels_of(&[(0, 0), (9, 3), (9, -20)]).collect();
+        assert_eq!((pixels[0], pixels[pixels.len() - 1]), ((0, 0), (9, -20)));
+        let is_near =
+            |p: &[(i32, i32)]| (p[0].0 - p[1].0).abs() <= 3 && (p[0].1 - p[1].1).abs() <= 3;
+        assert!(pixels.windows(2).all(is_near), "{pixels:?}");
     }
 
     #[test]
