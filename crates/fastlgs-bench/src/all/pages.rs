@@ -53,7 +53,10 @@ pub fn all(rows: &Rows) -> Result<Vec<(String, String)>> {
     ];
     for (name, panels, title, x, y) in charts {
         let axes = Axes { title, x, y };
-        files.push((name.to_owned(), plot::svg(&Panels { axes, panels })?));
+        files.push((
+            name.to_owned(),
+            plot::svg(&Panels { axes, panels }, stamp(rows).trim_end())?,
+        ));
     }
     files.push(("stability.svg".to_owned(), stability::chart(rows)?));
     Ok(files)

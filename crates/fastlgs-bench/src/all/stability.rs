@@ -125,5 +125,5 @@ pub fn chart(rows: &Rows) -> Result<String> {
             .map(|(name, changes)| (name.clone(), changes.iter().map(|c| cell(*c)).collect()))
             .collect::<Vec<_>>(),
     };
-    plot::svg(&heat)
+    plot::svg(&heat, stamp(rows).trim_end())
 }

@@ -54,14 +54,19 @@ fn register_font() {
     });
 }
 
-/// Returns a drawing as SVG.
+/// Height of a note below a chart, in pixels.
+const NOTE: u32 = 20;
+
+/// Returns a drawing as SVG, with a note below it.
 ///
 /// # Errors
 /// The drawing fails.
-pub fn svg(drawing: &impl Drawing) -> Result<String> {
+pub fn svg(drawing: &impl Drawing, note: &str) -> Result<String> {
     register_font();
+    let (width, height) = drawing.size();
     let mut svg = String::new();
-    on_white(SVGBackend::with_string(&mut svg, drawing.size()), drawing).map_err(failed)?;
+    let canvas = SVGBackend::with_string(&mut svg, (width, height + NOTE));
+    on_white(canvas, drawing, note).map_err(failed)?;
     Ok(svg)
 }
 
@@ -75,13 +80,14 @@ fn failed(error: Box<dyn std::error::Error>) -> anyhow::Error {
 /// The drawing fails, or a file cannot be written.
 pub fn save(folder: &Path, name: &str, drawing: &impl Drawing) -> Result<()> {
     let (width, height) = drawing.size();
-    let svg = svg(drawing)?;
+    let svg = svg(drawing, "")?;
     fastlgs_core::fs::write_atomic(&folder.join(format!("{name}.svg")), |file| {
         std::io::Write::write_all(file, svg.as_bytes())
     })?;
+    let height = height + NOTE;
     let mut pixels = vec![0; (3 * width * height) as usize];
     let canvas = BitMapBackend::with_buffer(&mut pixels, (width, height));
-    on_white(canvas, drawing).map_err(failed)?;
+    on_white(canvas, drawing, "").map_err(failed)?;
     let picture = RgbImage::from_raw(width, height, pixels).context("a chart's pixels")?;
     Ok(image_io::save_png(
         &folder.join(format!("{name}.png")),
@@ -89,13 +95,15 @@ pub fn save(folder: &Path, name: &str, drawing: &impl Drawing) -> Result<()> {
     )?)
 }
 
-fn on_white<DB: DrawingBackend>(backend: DB, drawing: &impl Drawing) -> Drawn
+fn on_white<DB: DrawingBackend>(backend: DB, drawing: &impl Drawing, note: &str) -> Drawn
 where
     DB::ErrorType: 'static,
 {
     let area = backend.into_drawing_area();
     area.fill(&WHITE)?;
-    drawing.draw(&area)?;
+    let (chart, foot) = area.split_vertically(drawing.size().1);
+    drawing.draw(&chart)?;
+    foot.draw(&Text::new(note.to_owned(), (8, 2), (FONT, 10)))?;
     Ok(area.present()?)
 }
 
@@ -140,13 +148,15 @@ mod tests {
             panel(vec![point(1.0, 0.5), point(10.0, f64::NAN)]),
             panel(Vec::new()),
         ];
-        let drawn = svg(&Panels { axes, panels }).expect("drawn");
-        assert!(drawn.contains("spot") && drawn.contains("panel") && drawn.contains("title"));
-        svg(&Panels {
+        let drawn = svg(&Panels { axes, panels }, "seeds: 0").expect("drawn");
+        for text in ["spot", "panel", "title", "seeds: 0"] {
+            assert!(drawn.contains(text), "{text}");
+        }
+        let empty = Panels {
             axes,
             panels: Vec::new(),
-        })
-        .expect("drawn");
+        };
+        svg(&empty, "").expect("drawn");
         let rows = [(
             "row".to_owned(),
             vec![Cell {
