@@ -295,9 +295,9 @@ fn score_views(
                 camera.name
             );
         }
-        scene.field(&camera, config.tau_ac)?; // compiles the shaders before the timing
+        scene.render_objects(&camera, config.tau_ac)?; // compiles the shaders before the timing
         let started = Instant::now();
-        let field = scene.field(&camera, config.tau_ac)?;
+        let field = scene.render_objects(&camera, config.tau_ac)?;
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
         // Loads the text encoder before the first query is timed.
         scene.text_query("warm up")?;
