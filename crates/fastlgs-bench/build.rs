@@ -1,4 +1,5 @@
-//! Embeds commit and date of the measured code: the last one that changed anything but the bench itself.
+//! Embeds commit and date of the measured code: the last one that changed anything but what measures, the bench and
+//! `fastlgs eval`.
 
 use std::process::Command;
 
@@ -15,6 +16,7 @@ fn main() {
             "Cargo.toml",
             "Cargo.lock",
             ":!crates/fastlgs-bench",
+            ":!crates/fastlgs/src/eval",
         ];
         let output = Command::new("git")
             .current_dir("../..")

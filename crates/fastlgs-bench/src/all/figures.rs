@@ -80,6 +80,11 @@ impl<'a> Runs<'a> {
             .map_or(String::new(), |mean| mean.text(digits))
     }
 
+    /// Formats a count, with its range if the seeds differ.
+    pub fn count(&self, figure: &str) -> String {
+        self.text(figure, 1).replace(".0", "")
+    }
+
     /// A comparison with the rows of other runs that have the same seed.
     fn against(
         &self,

@@ -36,4 +36,4 @@ pub fn stamp(rows: &Rows) -> String {
 
 pub const HOW_TO_READ: &str = "Means over the seeds, with their range in brackets. *Best object*: IoU of the best \
 single object, mean over the labels of held-out views. *Text*: IoU of the answer to the label's name. \
-*Seconds*: from photos to answers.\n";
+*Seconds*: from posed photos to answers; structure from motion is not included.\n";

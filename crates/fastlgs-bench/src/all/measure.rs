@@ -52,7 +52,6 @@ fn figures(scored: &Value, seconds: Value) -> Value {
         "gaussians",
         "objects",
         "scene_bytes",
-        "query_ms_first",
         "absent_rejected",
         "absent_texts",
         "apart",
@@ -61,6 +60,7 @@ fn figures(scored: &Value, seconds: Value) -> Value {
     ] {
         row[name] = scored[name].clone();
     }
+    row["query_ms"] = scored["query_ms_first"].clone();
     row
 }
 
@@ -74,81 +74,96 @@ impl Measure<'_> {
         if let How::Make(options) = planned.way.how {
             let folder = tempfile::tempdir_in(self.work)?;
             let (photos, labels) = self.photos(scene, seed)?;
-            return self.make(
-                &photos,
-                &labels,
-                &folder.path().join("scene"),
-                options,
-                seed,
-            );
+            let scene = folder.path().join("scene");
+            return self.make(&photos, &labels, &scene, options, seed);
         }
         let base = self.base(scene, seed)?;
-        let (before, done) = (&base.row["seconds"], base.row["seconds"].clone());
         if let How::Photos(change) = planned.way.how {
             return self.make_from_changed(&base, change, seed);
         }
         let run = Run { seed, ..*self.run };
         let trial = Trial::new(&base.scene, self.work, &run)?;
+        self.changed(planned.way.how, &base, &trial, seed)
+    }
+
+    /// Changes a copy of the base scene and returns its figures.
+    fn changed(&self, how: How, base: &Base, trial: &Trial, seed: u64) -> Result<Value> {
         let folder = trial.scene();
-        let train = |options: &[&str]| trial.train(&self.with_iterations(options), seed);
-        let remap_from = |file: &str, options: &[&str]| -> Result<Value> {
-            let start = ["--init", file, "--iterations", "0"];
-            let trained = trial.train(&[&start, options].concat(), seed)?;
-            let spent = seconds(
-                &before["preprocess"],
-                &before["train"],
-                &trained["mapping_seconds"],
-            );
-            Ok(figures(&trial.eval()?, spent))
-        };
-        let remap = |options: &[&str]| remap_from("SCENE/scene.ply", options);
-        match planned.way.how {
-            How::Make(_) | How::Photos(_) => unreachable!("measured above"),
+        let evaluated = || Ok(figures(&trial.eval()?, base.row["seconds"].clone()));
+        match how {
+            How::Make(_) | How::Photos(_) => unreachable!("these start from photos"),
             How::Train(options) => {
-                let trained = train(options)?;
+                let trained = trial.train(&self.with_iterations(options), seed)?;
                 let spent = seconds(
-                    &before["preprocess"],
+                    &base.row["seconds"]["preprocess"],
                     &trained["seconds"],
                     &trained["mapping_seconds"],
                 );
                 Ok(figures(&trial.eval()?, spent))
             }
-            How::Remap(options) => remap(options),
+            How::Remap(options) => self.remapped(base, trial, "SCENE/scene.ply", options, seed),
             How::Masks(change) => {
                 disturb::masks(&folder, change, seed + 1)?;
-                remap(&[])
+                self.remapped(base, trial, "SCENE/scene.ply", &[], seed)
             }
             How::Embeddings(noise) => {
                 disturb::embeddings(&folder, noise, seed + 1)?;
-                Ok(figures(&trial.eval()?, done))
+                evaluated()
             }
-            How::Baseline(method) => self.baseline(method, &trial, &base, seed),
-            How::Format(ending) => {
-                let file = folder.root.with_file_name(format!("scene.{ending}"));
-                let arguments = [text(&folder.root), text(&file)];
-                run_command(self.run, seed, "export", &arguments)?;
-                let mut row = remap_from(text(&file), &[])?;
-                let length = |path: &Path| -> Result<u64> { Ok(std::fs::metadata(path)?.len()) };
-                let others = row["scene_bytes"].as_u64().unwrap_or(0) - length(&folder.ply_path())?;
-                row["scene_bytes"] = json!(others + length(&file)?);
-                Ok(row)
-            }
-            How::Compact => Ok(figures(&self.compact(&trial, seed)?, done)),
+            How::Baseline(method) => self.baseline(method, trial, base, seed),
+            How::Format(ending) => self.exported(base, trial, ending, seed),
+            How::Compact => Ok(figures(
+                &self.compact(trial, seed)?,
+                base.row["seconds"].clone(),
+            )),
             How::Degree(degree) => {
                 ply::write(
                     &folder.ply_path(),
                     &folder.gaussians()?.with_sh_degree(degree),
                 )?;
-                Ok(figures(&trial.eval()?, done))
+                evaluated()
             }
             How::Kept(share) => {
                 let all = folder.gaussians()?;
                 let mut kept = most_important(&folder, &all, share)?;
                 kept.sort_unstable();
                 ply::write(&folder.ply_path(), &all.select(&kept))?;
-                Ok(figures(&trial.eval()?, done))
+                evaluated()
             }
         }
+    }
+
+    /// Maps the objects again to the Gaussians of `file`, and returns the figures.
+    fn remapped(
+        &self,
+        base: &Base,
+        trial: &Trial,
+        file: &str,
+        options: &[&str],
+        seed: u64,
+    ) -> Result<Value> {
+        let start = ["--init", file, "--iterations", "0"];
+        let trained = trial.train(&[&start, options].concat(), seed)?;
+        let before = &base.row["seconds"];
+        let spent = seconds(
+            &before["preprocess"],
+            &before["train"],
+            &trained["mapping_seconds"],
+        );
+        Ok(figures(&trial.eval()?, spent))
+    }
+
+    /// Exports the Gaussians to a file, maps the objects to them again, and returns the figures.
+    fn exported(&self, base: &Base, trial: &Trial, ending: &str, seed: u64) -> Result<Value> {
+        let folder = trial.scene();
+        let file = folder.root.with_file_name(format!("scene.{ending}"));
+        let arguments = [text(&folder.root), text(&file)];
+        run_command(self.run, seed, "export", &arguments)?;
+        let mut row = self.remapped(base, trial, text(&file), &[], seed)?;
+        let length = |path: &Path| -> Result<u64> { Ok(std::fs::metadata(path)?.len()) };
+        let others = row["scene_bytes"].as_u64().unwrap_or(0) - length(&folder.ply_path())?;
+        row["scene_bytes"] = json!(others + length(&file)?);
+        Ok(row)
     }
 
     /// Returns the folders of photos and labels. Generates them if the scene has none.
@@ -238,7 +253,8 @@ impl Measure<'_> {
     }
 
     /// Runs `fastlgs-bench baseline`. Fields with codes use the scene's objects, so their seconds
-    /// include its mapping.
+    /// include its mapping. Fields without objects have no best object, and the time of their
+    /// queries is that of rendering alone.
     fn baseline(&self, method: &str, trial: &Trial, base: &Base, seed: u64) -> Result<Value> {
         let scene = trial.scene();
         let arguments = ["baseline", text(&scene.root), "--method", method];
@@ -247,7 +263,8 @@ impl Measure<'_> {
         let mut field = found["seconds"]
             .as_f64()
             .context("the seconds of a baseline")?;
-        if !found["wrong_pixels"].is_null() {
+        let has_objects = !found["wrong_pixels"].is_null();
+        if has_objects {
             field += before["objects"].as_f64().unwrap_or(0.0);
         }
         let mut row = figures(
@@ -255,8 +272,11 @@ impl Measure<'_> {
             seconds(&before["preprocess"], &before["train"], &json!(field)),
         );
         row["right"] = Value::Null;
-        row["query_ms_first"] = found["render_ms"].clone();
         row["scene_bytes"] = Value::Null;
+        if !has_objects {
+            row["oracle_miou"] = Value::Null;
+            row["query_ms"] = found["render_ms"].clone();
+        }
         Ok(row)
     }
 

@@ -20,7 +20,7 @@ use fastlgs::Run;
 use fastlgs_core::fs;
 use fastlgs_synth::Kind;
 use measure::Measure;
-use plan::{SceneSource, WAYS};
+use plan::{BASE, Planned, SceneSource, WAYS};
 use rows::Rows;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -35,16 +35,16 @@ pub struct Args {
     /// commas.
     #[arg(long, value_delimiter = ',', default_value = "table")]
     scenes: Vec<String>,
-    /// Ways to measure, by their names in the tables, separated by commas. Default: all. `none`
-    /// only writes the pages again.
+    /// Ways to measure, by their names in the tables, separated by commas. Default: all. Missing
+    /// rows that they are compared with are measured as well. `none` only writes the pages again.
     #[arg(long, value_delimiter = ',', value_name = "NAMES")]
     ways: Vec<String>,
     /// Folder of real CLIP embeddings, for `fastlgs-bench clip`.
     #[arg(long, value_name = "FOLDER")]
     clip: Option<PathBuf>,
-    /// Number of seeds.
-    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..))]
-    seeds: u64,
+    /// Seeds, separated by commas.
+    #[arg(long, value_delimiter = ',', default_values_t = [0, 1, 2], value_name = "NUMBERS")]
+    seeds: Vec<u64>,
     /// Begin no further row after this time. The next run continues.
     #[arg(long)]
     minutes: Option<u64>,
@@ -116,11 +116,9 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         work: &work.canonicalize()?,
         iterations: args.iterations.map(|n| n.to_string()),
     };
-    let mut missing = plan::rows(&scenes, args.seeds);
-    missing.retain(|row| {
-        (args.ways.is_empty() || args.ways.iter().any(|name| name == row.way.name))
-            && !rows.has(row)
-    });
+    let mut missing = chosen(plan::rows(&scenes, &args.seeds), &args.ways);
+    missing.retain(|row| !rows.has(row));
+    let mut measured = Vec::new();
     let progress = run.work("rows", missing.len() as u64);
     for planned in &missing {
         let late = |minutes| started.elapsed() >= Duration::from_secs(60 * minutes);
@@ -137,6 +135,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         row["way"] = json!(planned.way.name);
         row["seed"] = json!(planned.seed);
         row["machine"] = json!(measure::machine());
+        measured.push(row.clone());
         rows.rows.push(row);
         fs::write_json(&file, &rows)?;
         progress.advance()?;
@@ -155,8 +154,30 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             &readme::with_figures(&text, &rows).with_context(|| readme.display().to_string())?,
         )?;
     }
-    let left = missing.iter().filter(|planned| !rows.has(planned)).count();
-    Ok(json!({ "rows": rows.rows.len(), "missing": left, "version": rows.version }))
+    Ok(json!({
+        "version": rows.version,
+        "rows": rows.rows.len(),
+        "missing": missing.len() - measured.len(),
+        "measured": measured,
+    }))
+}
+
+/// Returns the rows of the named ways, and the rows that they are compared with. All rows if no way
+/// is named.
+fn chosen<'a>(rows: Vec<Planned<'a>>, names: &[String]) -> Vec<Planned<'a>> {
+    if names.is_empty() {
+        return rows;
+    }
+    let is_named = |row: &Planned| names.iter().any(|name| name == row.way.name);
+    let needs = |row: &Planned, other: &Planned| {
+        let is_compared = [BASE, row.way.reference()].contains(&other.way.name);
+        is_compared && (&row.scene.name, row.seed) == (&other.scene.name, other.seed)
+    };
+    let is_kept =
+        |row: &Planned| is_named(row) || rows.iter().any(|r| is_named(r) && needs(r, row));
+    let kept: Vec<bool> = rows.iter().map(is_kept).collect();
+    let pairs = rows.into_iter().zip(kept);
+    pairs.filter(|pair| pair.1).map(|pair| pair.0).collect()
 }
 
 fn write(path: &Path, text: &str) -> Result<()> {
@@ -176,6 +197,28 @@ mod tests {
         assert!(names(&["no-such-scene"]).is_err());
         assert!(names(&["table", "table"]).is_err());
         assert!(names(&["table", "twins"]).is_ok());
+    }
+
+    #[test]
+    fn a_way_is_measured_with_its_references() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let photos = folder.path().join("fox");
+        std::fs::create_dir_all(photos.join("labels")).expect("photos");
+        let scenes = [
+            SceneSource::of(photos.to_str().expect("UTF-8")),
+            SceneSource::of("table"),
+        ];
+        let names = |ways: &[&str]| -> Vec<(String, &str, u64)> {
+            let ways: Vec<String> = ways.iter().map(|way| (*way).to_owned()).collect();
+            let rows = chosen(plan::rows(&scenes, &[1]), &ways);
+            let name = |row: Planned| (row.scene.name.clone(), row.way.name, row.seed);
+            rows.into_iter().map(name).collect()
+        };
+        let of_fox = |way| ("fox".to_owned(), way, 1);
+        let expected = [BASE, plan::UNCHANGED, "blur 2 px"].map(of_fox);
+        assert_eq!(names(&["blur 2 px"]), expected);
+        assert_eq!(names(&["none"]), []);
+        assert!(names(&[]).len() > 50);
     }
 
     /// The committed pages are those of the committed rows, and so is the table in the README.

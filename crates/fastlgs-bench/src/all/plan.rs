@@ -1,6 +1,7 @@
 //! The rows of `fastlgs-bench all`: each is a way of making a scene, or of changing one.
 
 use crate::disturb::{MaskChange, PhotoChange};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// A page of the results.
@@ -19,7 +20,7 @@ pub enum On {
     Given,
     /// The first two given scenes with photos.
     TwoPhotographed,
-    /// The same with seed 0 alone: 30,000 iterations take an hour.
+    /// The same with the first seed alone: 30,000 iterations take most of an hour.
     TwoPhotographedOnce,
     /// Scenes generated to be difficult, which need not be given.
     Difficult,
@@ -30,7 +31,7 @@ pub enum On {
 pub enum How {
     /// `preprocess` and `train`, with these further options of `preprocess`.
     Make(&'static [&'static str]),
-    /// The same from changed photos. Held-out views without labels are left out.
+    /// The same from changed photos of training. Held-out views without labels are left out.
     Photos(PhotoChange),
     /// `train` with these options, on the prepared scene.
     Train(&'static [&'static str]),
@@ -57,6 +58,8 @@ pub struct Way {
     /// Pages that have it.
     pub pages: &'static [Page],
     pub name: &'static str,
+    /// What exactly is done, for readers of the pages.
+    pub about: &'static str,
     pub on: On,
     pub how: How,
 }
@@ -65,8 +68,7 @@ impl Way {
     /// Name of the way whose rows this one is compared with.
     pub fn reference(&self) -> &'static str {
         match self.how {
-            How::Photos(_) => UNCHANGED,
-            How::Remap(_) if self.pages == [Page::Stability] => "paper's mapping",
+            How::Photos(change) if change != PhotoChange::Unchanged => UNCHANGED,
             _ => BASE,
         }
     }
@@ -79,16 +81,23 @@ impl Way {
 
 /// The default way: preset quick. It is on all pages, and most ways start from its scene.
 pub const BASE: &str = "quick";
-/// Photos as they are: the reference of disturbed photos.
+/// The reference of changed photos.
 pub const UNCHANGED: &str = "photos as they are";
 
 /// Training without the automatic limit of the number of Gaussians.
-pub const UNLIMITED: &str = "no limit of Gaussians";
+pub const UNLIMITED: &str = "at most 1000000 Gaussians";
 
-const fn way(pages: &'static [Page], name: &'static str, on: On, how: How) -> Way {
+const fn way(
+    pages: &'static [Page],
+    name: &'static str,
+    about: &'static str,
+    on: On,
+    how: How,
+) -> Way {
     Way {
         pages,
         name,
+        about,
         on,
         how,
     }
@@ -102,207 +111,311 @@ pub const WAYS: &[Way] = {
     use On::{Difficult, Given, TwoPhotographed, TwoPhotographedOnce};
     use Page::{Paper, Size, Speed, Stability};
     &[
-        way(&[Speed, Stability, Size, Paper], BASE, Given, Make(&[])),
-        way(&[Stability], "as it is", Difficult, Make(&[])),
+        way(
+            &[Speed, Stability, Size, Paper],
+            BASE,
+            "the default of `fastlgs make`; photos of at most 480 pixels a side",
+            Given,
+            Make(&[]),
+        ),
+        way(
+            &[Stability],
+            "as it is",
+            "*quick* on a scene that is generated to be difficult",
+            Difficult,
+            Make(&[]),
+        ),
         way(
             &[Paper, Speed],
             "paper's mapping",
+            "`train --mapping paper`: Algorithm 1 finds the objects by embeddings, key points and colours",
             Given,
             Remap(&["--mapping", "paper"]),
         ),
         way(
             &[Paper],
             "paper's mapping by embeddings and key points",
+            "Algorithm 1 without colours",
             Given,
             Remap(&["--mapping", "paper", "--cues", "keypoints"]),
         ),
         way(
             &[Paper],
             "paper's mapping by embeddings",
+            "Algorithm 1 without colours and key points",
             Given,
             Remap(&["--mapping", "paper", "--cues", "none"]),
         ),
         way(
             &[Paper, Speed],
             "mean embeddings without a grid",
+            "each Gaussian has the mean embedding of its masks; each pixel is classified alone",
             Given,
             Baseline("raw"),
         ),
         way(
             &[Paper, Size],
             "code of 3 numbers",
+            "each object has a code of 3 numbers; a pixel belongs to the object with the nearest code",
             Given,
             Baseline("code3"),
         ),
-        way(&[Size], "compact", Given, Compact),
-        way(&[Size], "SPZ", Given, Format("spz")),
-        way(&[Size], "SOG", Given, Format("sog")),
-        way(&[Size], "half of the Gaussians", Given, Kept(0.5)),
-        way(&[Size], "a quarter of the Gaussians", Given, Kept(0.25)),
-        way(&[Size], "SH degree 0", Given, Degree(0)),
+        way(
+            &[Size],
+            "compact",
+            "`export SCENE FOLDER`: a scene folder with compressed Gaussians",
+            Given,
+            Compact,
+        ),
+        way(
+            &[Size],
+            "SPZ",
+            "Gaussians of `export SCENE FILE.spz`; the objects are mapped again",
+            Given,
+            Format("spz"),
+        ),
+        way(
+            &[Size],
+            "SOG",
+            "Gaussians of `export SCENE FILE.sog`; the objects are mapped again",
+            Given,
+            Format("sog"),
+        ),
+        way(
+            &[Size],
+            "half of the Gaussians",
+            "those that change the training views most, without further training",
+            Given,
+            Kept(0.5),
+        ),
+        way(
+            &[Size],
+            "a quarter of the Gaussians",
+            "the same with a quarter",
+            Given,
+            Kept(0.25),
+        ),
+        way(
+            &[Size],
+            "SH degree 0",
+            "colours without their dependence on the direction, without further training",
+            Given,
+            Degree(0),
+        ),
         way(
             &[Stability],
             UNCHANGED,
+            "*quick* from the prepared photos; the reference of all changed photos",
             TwoPhotographed,
             Photos(PhotoChange::Unchanged),
         ),
         way(
             &[Stability, Speed],
             "half of the photos missing",
+            "a random half of the training photos is removed",
             TwoPhotographed,
             Photos(PhotoChange::Missing(0.5)),
         ),
         way(
             &[Stability],
             "blur 2 px",
+            "each training photo is blurred by a Gaussian of 2 pixels",
             TwoPhotographed,
             Photos(PhotoChange::Blur(2.0)),
         ),
         way(
             &[Stability],
             "exposure 1 stop",
+            "each training photo has another brightness: normally distributed, standard deviation 1 stop",
             TwoPhotographed,
             Photos(PhotoChange::Exposure(1.0)),
         ),
         way(
             &[Stability],
             "pose noise 4 px",
+            "each camera is turned by a random angle, 4 pixels in the mean",
             TwoPhotographed,
             Photos(PhotoChange::Pose(4.0)),
         ),
         way(
             &[Stability],
             "focal length 10 % too long",
+            "the stated focal length of all training photos",
             TwoPhotographed,
             Photos(PhotoChange::Focal(0.1)),
         ),
         way(
             &[Stability],
             "white balance 20 %",
+            "each training photo has another red and blue: normally distributed, standard deviation 20 %",
             TwoPhotographed,
             Photos(PhotoChange::WhiteBalance(0.2)),
         ),
         way(
             &[Stability],
             "JPEG quality 15",
+            "each training photo is compressed",
             TwoPhotographed,
             Photos(PhotoChange::Jpeg(15)),
         ),
         way(
             &[Stability],
             "photos in random order",
+            "the training photos are renamed",
             TwoPhotographed,
             Photos(PhotoChange::Shuffled),
         ),
         way(
             &[Stability, Speed],
             "three quarters of the photos missing",
+            "a random quarter of the training photos stays",
             TwoPhotographed,
             Photos(PhotoChange::Missing(0.75)),
         ),
         way(
             &[Stability],
             "masks of whole objects only",
+            "`preprocess --levels whole`: no masks of parts",
             TwoPhotographed,
             Make(&["--levels", "whole"]),
         ),
         way(
             &[Stability],
             "40 % of the masks split",
+            "a random line through the centre splits each of them",
             Given,
             Masks(MaskChange::Split(0.4)),
         ),
         way(
             &[Stability],
             "40 % of the masks merged",
+            "each of them is merged with a random neighbour",
             Given,
             Masks(MaskChange::Merged(0.4)),
         ),
         way(
             &[Stability],
             "40 % of the masks missing",
+            "a random choice in each photo",
             Given,
             Masks(MaskChange::Dropped(0.4)),
         ),
         way(
             &[Stability],
             "masks eroded by 2 px",
+            "each mask loses its border",
             Given,
             Masks(MaskChange::Eroded(2)),
         ),
         way(
             &[Stability],
             "noise of half an embedding's length",
+            "random vectors are added to the embeddings of all objects",
             Given,
             Embeddings(0.5),
         ),
         way(
             &[Speed, Size],
             "at most 10000 Gaussians",
+            "`train --preset quick --budget 10000`",
             Given,
             Train(&["--preset", "quick", "--budget", "10000"]),
         ),
         way(
             &[Speed],
             "side 240",
+            "photos of at most 240 pixels a side",
             TwoPhotographed,
             Make(&["--max-side", "240"]),
         ),
         way(
             &[Speed],
             "standard",
+            "`train --preset standard`",
             Given,
             Train(&["--preset", "standard"]),
         ),
         way(
             &[Size, Speed],
             UNLIMITED,
+            "`train --preset quick --budget 1000000`; no scene needs as many, so nothing limits them",
             Given,
             Train(&["--preset", "quick", "--budget", "1000000"]),
         ),
         way(
             &[Speed],
             "side 720",
+            "photos of at most 720 pixels a side",
             TwoPhotographed,
             Make(&["--max-side", "720"]),
         ),
         way(
             &[Paper, Speed],
             "like LangSplat",
+            "each Gaussian has two embeddings, of whole and of part masks, compressed to three numbers by a scene-wise autoencoder; each pixel is classified alone",
             Given,
             Baseline("langsplat"),
         ),
-        way(&[Paper, Speed], "like LERF", Given, Baseline("lerf")),
-        way(&[Size], "code of 1 number", Given, Baseline("code1")),
-        way(&[Size], "code of 2 numbers", Given, Baseline("code2")),
-        way(&[Size], "code of 4 numbers", Given, Baseline("code4")),
         way(
-            &[Stability],
+            &[Paper, Speed],
+            "like LERF",
+            "each Gaussian has embeddings of photo tiles at three scales; each pixel is classified alone",
+            Given,
+            Baseline("lerf"),
+        ),
+        way(
+            &[Size],
+            "code of 1 number",
+            "the same with 1 number",
+            Given,
+            Baseline("code1"),
+        ),
+        way(
+            &[Size],
+            "code of 2 numbers",
+            "the same with 2 numbers",
+            Given,
+            Baseline("code2"),
+        ),
+        way(
+            &[Size],
+            "code of 4 numbers",
+            "the same with 4 numbers",
+            Given,
+            Baseline("code4"),
+        ),
+        way(
+            &[Paper],
             "paper: theta 0.98",
+            "Algorithm 1 with another least similarity of embeddings, instead of 0.7",
             Given,
             Remap(&["--mapping", "paper", "--theta", "0.98"]),
         ),
         way(
-            &[Stability],
+            &[Paper],
             "paper: tau 30",
+            "Algorithm 1 with another least number of key points, instead of 4",
             Given,
             Remap(&["--mapping", "paper", "--tau", "30"]),
         ),
         way(
-            &[Stability],
+            &[Paper],
             "paper: alpha 0.05",
+            "Algorithm 1 with another weight of colours, instead of 0.3",
             Given,
             Remap(&["--mapping", "paper", "--alpha", "0.05"]),
         ),
         way(
             &[Paper, Speed],
-            "all as in the paper",
+            "preset like-paper",
+            "`train --preset like-paper`: Algorithm 1, and codes trained with the colours for 30,000 iterations",
             TwoPhotographedOnce,
             Train(&["--preset", "like-paper"]),
         ),
         way(
             &[Speed],
             "paper",
+            "`train --preset paper`: 30,000 iterations",
             TwoPhotographedOnce,
             Train(&["--preset", "paper"]),
         ),
@@ -377,7 +490,9 @@ pub fn difficult(given: &[SceneSource]) -> Vec<SceneSource> {
 
 /// Returns the rows of all pages: first [`BASE`] with all seeds, then all other ways seed by seed,
 /// so that an interrupted run has all ways before it has all seeds.
-pub fn rows(scenes: &[SceneSource], seeds: u64) -> Vec<Planned<'_>> {
+pub fn rows<'a>(scenes: &'a [SceneSource], seeds: &[u64]) -> Vec<Planned<'a>> {
+    let seeds: BTreeSet<u64> = seeds.iter().copied().collect();
+    let first = seeds.first().copied();
     let photographed: Vec<&SceneSource> = scenes
         .iter()
         .filter(|s| s.given && s.photos.is_some() && s.labelled)
@@ -386,11 +501,11 @@ pub fn rows(scenes: &[SceneSource], seeds: u64) -> Vec<Planned<'_>> {
     let is_on = |scene: &SceneSource, way: &Way, seed: u64| match way.on {
         On::Given => scene.given && (scene.labelled || way.needs_no_labels()),
         On::TwoPhotographed => photographed.contains(&scene),
-        On::TwoPhotographedOnce => seed == 0 && photographed.contains(&scene),
+        On::TwoPhotographedOnce => Some(seed) == first && photographed.contains(&scene),
         On::Difficult => !scene.given,
     };
     let mut rows = Vec::new();
-    for seed in 0..seeds {
+    for seed in seeds {
         for way in WAYS {
             let on = scenes.iter().filter(|scene| is_on(scene, way, seed));
             rows.extend(on.map(|scene| Planned { scene, way, seed }));
@@ -403,7 +518,6 @@ pub fn rows(scenes: &[SceneSource], seeds: u64) -> Vec<Planned<'_>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::collections::BTreeSet;
 
     #[test]
     fn rows_are_distinct_and_the_default_way_comes_first() {
@@ -417,7 +531,7 @@ mod tests {
         assert!(scenes[0].photos.is_some() && scenes[1].photos.is_none());
         scenes.extend(difficult(&scenes));
         assert_eq!(scenes.len(), 2 + DIFFICULT.len());
-        let rows = rows(&scenes, 3);
+        let rows = rows(&scenes, &[0, 1, 2]);
         let first: Vec<(&str, u64)> = rows[..6]
             .iter()
             .map(|r| (r.scene.name.as_str(), r.seed))

@@ -6,6 +6,7 @@ use super::plan::BASE;
 use super::rows::Rows;
 use super::texts;
 use anyhow::{Context, Result};
+use fastlgs_synth::Kind;
 use serde_json::Value;
 
 /// Markers of the generated table and picture.
@@ -42,6 +43,12 @@ fn replaced(readme: &str, [begin, end]: [&str; 2], new: &str) -> Result<String> 
     Ok(format!("{before}{begin}{new}{end}{after}"))
 }
 
+/// Marks generated scenes, which have exact masks.
+fn titled(scene: &str) -> String {
+    let note = Kind::of(scene).map_or("", |_| " (generated, exact masks)");
+    format!("{scene}{note}")
+}
+
 fn readme_table(rows: &Rows) -> String {
     let scenes: Vec<(&str, Runs)> = labelled(rows)
         .into_iter()
@@ -73,29 +80,28 @@ fn readme_table(rows: &Rows) -> String {
             runs.text("miou", 2)
         }),
         line("texts that are answered correctly", &|runs| {
-            let right = runs.text("right", 1).replace(".0", "");
-            format!("{right} of {}", first(runs, "labels"))
+            format!("{} of {}", runs.count("right"), first(runs, "labels"))
         }),
         line("absent texts that are refused", &|runs| {
             format!(
                 "{} of {}",
-                runs.text("absent_rejected", 0),
+                runs.count("absent_rejected"),
                 first(runs, "absent_texts")
             )
         }),
-        line("seconds from photos to answers", &|runs| {
+        line("seconds from posed photos to answers", &|runs| {
             runs.seconds(None).map_or(String::new(), |s| s.text(0))
         }),
     ];
     let titles: Vec<String> = scenes
         .iter()
-        .map(|(scene, runs)| format!("{scene}, {}", first(runs, "size")))
+        .map(|(scene, runs)| format!("{}, {}", titled(scene), first(runs, "size")))
         .collect();
     let head: Vec<&str> = std::iter::once("")
         .chain(titles.iter().map(String::as_str))
         .collect();
     format!(
-        "{}\n{}\n![accuracy against seconds from photos to answers](docs/results/speed.svg)\n",
+        "{}\n{}\n![accuracy against seconds from posed photos to answers](docs/results/speed.svg)\n",
         stamp(rows),
         table(&head, &lines)
     )
@@ -112,7 +118,7 @@ mod tests {
         let readme = format!("# Title\n{}and\n{}more\n", between(TEXTS), between(FIGURES));
         let new = with_figures(&readme, &rows()).expect("markers");
         assert!(
-            new.contains("The built-in encoder answers 2 of 4 labelled names in 1 scenes"),
+            new.contains("The built-in encoder answers 2 of 4 labels correctly (fox)"),
             "{new}"
         );
         assert!(new.starts_with("# Title\n") && new.ends_with("\nmore\n") && !new.contains("old"));

@@ -11,8 +11,7 @@ use anyhow::Result;
 pub fn disturbances(rows: &Rows) -> Vec<(String, Vec<Option<Mean>>)> {
     let scenes = labelled(rows);
     let mut found = Vec::new();
-    for way in on(Page::Stability).filter(|way| ![BASE, UNCHANGED, "as it is"].contains(&way.name))
-    {
+    for way in on(Page::Stability).filter(|way| ![BASE, "as it is"].contains(&way.name)) {
         let change = |scene: &&str| {
             let runs = Runs::of(rows, scene, way.name)?;
             let change = runs.change(figure_of(way), &Runs::of(rows, scene, way.reference())?)?;
@@ -20,12 +19,12 @@ pub fn disturbances(rows: &Rows) -> Vec<(String, Vec<Option<Mean>>)> {
         };
         let changes: Vec<Option<Mean>> = scenes.iter().map(change).collect();
         if changes.iter().any(Option::is_some) {
-            let unit = if figure_of(way) == "miou" {
-                " (answers to texts)"
-            } else {
-                ""
+            let note = match way.name {
+                UNCHANGED => " (against quick)",
+                _ if figure_of(way) == "miou" => " (answers to texts)",
+                _ => "",
             };
-            found.push((format!("{}{unit}", way.name), changes));
+            found.push((format!("{}{note}", way.name), changes));
         }
     }
     let worst = |row: &(String, Vec<Option<Mean>>)| {
@@ -95,8 +94,9 @@ pub fn page(rows: &Rows) -> String {
     let difficult: Vec<Vec<String>> = self::scenes(rows).into_iter().filter_map(line).collect();
     format!(
         "# Stability\n\n{}\n{HOW_TO_READ}\n## Disturbed inputs, worst first\n\nChange of *best object* in points (hundredths of \
-         IoU) against the same seed without the disturbance; *answers to texts*: of *text*. Disturbed photos are those of training; labelled views \
-         stay as they are. Poses of disturbed photos are checked and refined as usual.\n\n![changes](stability.svg)\n\n{}\n## Scenes, worst \
+         IoU) against the same seed without the disturbance; *answers to texts*: of *text*. Changed photos are compared with *photos as they are*, whose own difference \
+         from *quick* is mere chance. Labelled views stay as they are. Poses of changed photos are checked and refined as usual. \
+         [What each disturbance is](README.md#ways).\n\n![changes](stability.svg)\n\n{}\n## Scenes, worst \
          first\n\n{}",
         stamp(rows),
         table(&head, &lines),
@@ -118,7 +118,7 @@ pub fn page(rows: &Rows) -> String {
 pub fn chart(rows: &Rows) -> Result<String> {
     let scenes = labelled(rows);
     let heat = HeatMap {
-        title: "IoU that the best objects lose (red) or gain, in hundredths. Grey: not measured",
+        title: "IoU that best objects (or answers to texts) lose (red) or gain, in hundredths. Grey: not measured",
         columns: &scenes,
         rows: &disturbances(rows)
             .iter()

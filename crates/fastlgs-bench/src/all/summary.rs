@@ -13,7 +13,7 @@ use std::fmt::Write as _;
 const GOOD_IOU: f64 = 0.8;
 /// Disturbances that cost more points than this on some scene are listed as failures.
 const MANY_POINTS: f64 = 10.0;
-/// Disturbances that cost fewer points than this on every scene are listed as harmless.
+/// Disturbances that cost fewer points than this on every measured scene are listed as harmless.
 const FEW_POINTS: f64 = 2.0;
 
 /// Returns a list of what fails, and of what does not.
@@ -43,7 +43,7 @@ pub fn failures(rows: &Rows) -> String {
         .collect();
     let listed = |keep: &dyn Fn(f64) -> bool| {
         let kept = losses.iter().filter(|(_, loss)| keep(*loss));
-        let named = kept.map(|(name, loss)| format!("{name} ({})", signed(*loss, 0)));
+        let named = kept.map(|(name, loss)| format!("{name} ({})", signed(*loss, 1)));
         named.collect::<Vec<_>>().join(", ")
     };
     for (about, names) in [
@@ -52,7 +52,9 @@ pub fn failures(rows: &Rows) -> String {
             listed(&|loss| loss < -MANY_POINTS),
         ),
         (
-            format!("Disturbances that cost less than {FEW_POINTS:.0} points on every scene"),
+            format!(
+                "Disturbances that cost less than {FEW_POINTS:.0} points on every measured scene"
+            ),
             listed(&|loss| loss > -FEW_POINTS),
         ),
     ] {
@@ -143,12 +145,12 @@ mod tests {
         let text = failures(&rows());
         assert!(
             text.contains(
-                "more than 10 points on some scene, with the largest loss: blur 2 px (-30)"
+                "more than 10 points on some scene, with the largest loss: blur 2 px (-30.0)"
             ),
             "{text}"
         );
         assert!(
-            text.contains("twins 0.30") && text.contains("JPEG quality 15 (-1)"),
+            text.contains("twins 0.30") && text.contains("JPEG quality 15 (-1.0)"),
             "{text}"
         );
     }

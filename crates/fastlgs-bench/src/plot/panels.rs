@@ -92,6 +92,14 @@ fn ticks(left: f64, right: f64) -> Vec<f64> {
     numbers.filter(|x| (left..=right).contains(x)).collect()
 }
 
+/// Returns the smallest and the largest value.
+fn span(values: impl Iterator<Item = f64>) -> (f64, f64) {
+    let ends = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
+        (low.min(v), high.max(v))
+    });
+    if ends.0.is_finite() { ends } else { (1.0, 2.0) }
+}
+
 /// Scatter charts beside each other, with logarithmic x axes and the names of their points.
 pub struct Panels<'a> {
     pub axes: Axes<'a>,
@@ -108,18 +116,8 @@ impl Panels<'_> {
         DB::ErrorType: 'static,
     {
         let points = || panel.points.iter().filter(|p| p.x > 0.0 && p.y.is_finite());
-        let span = |values: &mut dyn Iterator<Item = f64>| {
-            let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| {
-                (l.min(v), h.max(v))
-            });
-            if low.is_finite() {
-                (low, high)
-            } else {
-                (1.0, 2.0)
-            }
-        };
-        let (left, right) = span(&mut points().map(|p| p.x));
-        let (low, high) = span(&mut points().flat_map(|p| [p.range.0, p.range.1]));
+        let (left, right) = span(points().map(|p| p.x));
+        let (low, high) = span(points().flat_map(|p| [p.range.0, p.range.1]));
         // Differences that seeds make alone do not fill the chart.
         let margin = 0.1 * (high - low) + 0.5 * (MIN_SPAN - (high - low)).max(0.0);
         let beside = 1.1 * (right / left).powf(0.1);
