@@ -88,19 +88,22 @@ fn scenes(names: &[String]) -> Result<Vec<SceneSource>> {
     Ok(scenes)
 }
 
-/// Runs the missing rows, and writes all pages.
-pub fn run(args: &Args, run: &Run) -> Result<Value> {
-    if let Some(unknown) = args
-        .ways
-        .iter()
-        .find(|name| *name != "none" && !WAYS.iter().any(|way| way.name == **name))
-    {
+/// Refuses unknown names of ways.
+fn check_ways(names: &[String]) -> Result<()> {
+    let is_known = |name: &str| name == "none" || WAYS.iter().any(|way| way.name == name);
+    if let Some(unknown) = names.iter().find(|name| !is_known(name)) {
         let known: Vec<&str> = WAYS.iter().map(|way| way.name).collect();
         bail!(
             "--ways: '{unknown}' is unknown; choose from {}",
             known.join(", ")
         );
     }
+    Ok(())
+}
+
+/// Measures the missing rows, and writes all pages.
+pub fn run(args: &Args, run: &Run) -> Result<Value> {
+    check_ways(&args.ways)?;
     let started = Instant::now();
     let scenes = scenes(&args.scenes)?;
     std::fs::create_dir_all(&args.output).with_context(|| args.output.display().to_string())?;
@@ -144,16 +147,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         rows.clip = Some(serde_json::to_value(clip::run(&clip::Args { folder })?)?);
         fs::write_json(&file, &rows)?;
     }
-    for (name, text) in pages::all(&rows)? {
-        write(&args.output.join(name), &text)?;
-    }
-    if let Some(readme) = &args.readme {
-        let text = String::from_utf8_lossy(&fs::read(readme)?).into_owned();
-        write(
-            readme,
-            &readme::with_figures(&text, &rows).with_context(|| readme.display().to_string())?,
-        )?;
-    }
+    write_pages(args, &rows)?;
     Ok(json!({
         "version": rows.version,
         "rows": rows.rows.len(),
@@ -178,6 +172,19 @@ fn chosen<'a>(rows: Vec<Planned<'a>>, names: &[String]) -> Vec<Planned<'a>> {
     let kept: Vec<bool> = rows.iter().map(is_kept).collect();
     let pairs = rows.into_iter().zip(kept);
     pairs.filter(|pair| pair.1).map(|pair| pair.0).collect()
+}
+
+fn write_pages(args: &Args, rows: &Rows) -> Result<()> {
+    for (name, text) in pages::all(rows)? {
+        write(&args.output.join(name), &text)?;
+    }
+    if let Some(readme) = &args.readme {
+        let text = String::from_utf8_lossy(&fs::read(readme)?).into_owned();
+        let name = || readme.display().to_string();
+        let new = readme::with_figures(&text, rows).with_context(name)?;
+        write(readme, &new)?;
+    }
+    Ok(())
 }
 
 fn write(path: &Path, text: &str) -> Result<()> {
