@@ -53,17 +53,28 @@ impl Mean {
 }
 
 /// The rows of a way on a scene, one for each seed.
-pub struct Runs<'a>(pub Vec<&'a Value>);
+pub struct Runs<'a> {
+    pub rows: Vec<&'a Value>,
+    /// The rows whose times count: those of the processor that measured the most rows, if there are
+    /// any, else all.
+    timed: Vec<&'a Value>,
+}
 
 impl<'a> Runs<'a> {
     pub fn of(rows: &'a Rows, scene: &str, way: &str) -> Option<Self> {
         let is_run = |row: &&Value| row["scene"] == scene && row["way"] == way;
         let runs: Vec<&Value> = rows.rows.iter().filter(is_run).collect();
-        (!runs.is_empty()).then_some(Self(runs))
+        let main = machines(rows).first().copied();
+        let is_main = |row: &&Value| row["machine"].as_str() == main && row["seconds"].is_object();
+        let mut timed: Vec<&Value> = runs.iter().copied().filter(is_main).collect();
+        if timed.is_empty() {
+            timed = runs.clone();
+        }
+        (!runs.is_empty()).then_some(Self { rows: runs, timed })
     }
 
     pub fn mean(&self, figure: &str) -> Option<Mean> {
-        Mean::of(self.0.iter().filter_map(|row| row[figure].as_f64()))
+        Mean::of(self.rows.iter().filter_map(|row| row[figure].as_f64()))
     }
 
     /// Seconds from photos to answers, or of one stage.
@@ -72,7 +83,7 @@ impl<'a> Runs<'a> {
             Some(stage) => row["seconds"][stage].as_f64(),
             None => total_seconds(row),
         };
-        Mean::of(self.0.iter().filter_map(of))
+        Mean::of(self.timed.iter().filter_map(of))
     }
 
     pub fn text(&self, figure: &str, digits: usize) -> String {
@@ -91,9 +102,9 @@ impl<'a> Runs<'a> {
         reference: &Self,
         compare: impl Fn(&Value, &Value) -> Option<f64>,
     ) -> Option<Mean> {
-        Mean::of(self.0.iter().filter_map(|row| {
+        Mean::of(self.rows.iter().filter_map(|row| {
             let is_same = |other: &&&Value| other["seed"] == row["seed"];
-            compare(row, reference.0.iter().find(is_same)?)
+            compare(row, reference.rows.iter().find(is_same)?)
         }))
     }
 
@@ -108,6 +119,15 @@ impl<'a> Runs<'a> {
     pub fn ratio(&self, figure: impl Fn(&Value) -> Option<f64>, reference: &Self) -> Option<Mean> {
         self.against(reference, |row, other| Some(figure(row)? / figure(other)?))
     }
+
+    /// Ratio of the seconds of all stages, where the same processor measured both.
+    pub fn time_ratio(&self, reference: &Self) -> Option<Mean> {
+        self.against(reference, |row, other| {
+            let is_comparable = row["machine"] == other["machine"];
+            let ratio = total_seconds(row)? / total_seconds(other)?;
+            is_comparable.then_some(ratio)
+        })
+    }
 }
 
 /// Formats a number with its sign; without one if it is rounded to zero.
@@ -121,9 +141,22 @@ pub fn signed(value: f64, digits: usize) -> String {
 }
 
 /// Seconds of all stages of a row.
-pub fn total_seconds(row: &Value) -> Option<f64> {
+fn total_seconds(row: &Value) -> Option<f64> {
     let stages = row["seconds"].as_object()?.values();
     Some(stages.filter_map(Value::as_f64).sum())
+}
+
+/// Returns the processors, those with the most rows first.
+pub fn machines(rows: &Rows) -> Vec<&str> {
+    let mut found = distinct(rows, "machine");
+    let count = |name: &str| {
+        rows.rows
+            .iter()
+            .filter(|row| row["machine"] == name)
+            .count()
+    };
+    found.sort_by_key(|name| std::cmp::Reverse(count(name)));
+    found
 }
 
 /// Returns the distinct texts of a field, in order of their first row.
@@ -152,7 +185,21 @@ pub fn labelled(rows: &Rows) -> Vec<&str> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::pages::tests::rows;
     use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn times_of_two_processors_are_not_mixed() {
+        let mut rows = rows();
+        rows.rows[0]["machine"] = json!("another");
+        let quick = Runs::of(&rows, "fox", BASE).expect("two rows");
+        assert_eq!(quick.rows.len(), 2);
+        assert_eq!(quick.seconds(None), Mean::of([15.0]));
+        let standard = Runs::of(&rows, "fox", "standard").expect("a row");
+        assert_eq!(standard.time_ratio(&quick), None);
+        assert!(standard.change("oracle_miou", &quick).is_some());
+    }
 
     #[test]
     fn zero_has_no_sign() {

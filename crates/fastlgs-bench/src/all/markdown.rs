@@ -1,6 +1,6 @@
 //! What all pages have in common.
 
-use super::figures::distinct;
+use super::figures::{distinct, machines};
 use super::rows::Rows;
 use std::collections::BTreeSet;
 
@@ -21,10 +21,16 @@ pub fn stamp(rows: &Rows) -> String {
         .iter()
         .filter_map(|row| row["seed"].as_u64())
         .collect();
+    let machines = machines(rows);
+    let times = if machines.len() > 1 {
+        " Times are of the first processor, if it has measured them."
+    } else {
+        ""
+    };
     format!(
-        "FastLGS {}. {}. Device: {}. Seeds: {}.\n",
+        "FastLGS {}. {}. Device: {}. Seeds: {}.{times}\n",
         rows.version,
-        distinct(rows, "machine").join("; "),
+        machines.join("; "),
         distinct(rows, "adapter").join("; "),
         seeds
             .iter()

@@ -191,7 +191,7 @@ fn scenes(rows: &Rows) -> String {
     let line = |scene: &str| {
         let runs = Runs::of(rows, scene, BASE).or_else(|| Runs::of(rows, scene, "as it is"))?;
         let kind = Kind::of(scene).map_or("", |_| "generated");
-        let size = runs.0[0]["size"].as_str().unwrap_or_default();
+        let size = runs.rows[0]["size"].as_str().unwrap_or_default();
         Some(vec![
             scene.to_owned(),
             kind.to_owned(),
@@ -251,7 +251,7 @@ fn speed_lines(rows: &Rows, scene: &str, fronts: [&[Panel]; 2]) -> Vec<Vec<Strin
         vec![
             scene.to_owned(),
             (*name).to_owned(),
-            runs.0.len().to_string(),
+            runs.rows.len().to_string(),
             format!("{seconds:.0}"),
             ["preprocess", "train", "objects"].map(stage).join(" + "),
             runs.text("query_ms", 0),
@@ -309,7 +309,7 @@ fn size(rows: &Rows) -> String {
                 lines.push(vec![
                     scene.to_owned(),
                     name.to_owned(),
-                    runs.0.len().to_string(),
+                    runs.rows.len().to_string(),
                     runs.text("gaussians", 0),
                     megabytes(&runs).map_or(String::new(), |m| m.text(1)),
                     runs.text("psnr", 2),

@@ -59,7 +59,7 @@ fn readme_table(rows: &Rows) -> String {
             .chain(scenes.iter().map(|(_, runs)| of(runs)))
             .collect::<Vec<String>>()
     };
-    let first = |runs: &Runs, name: &str| match &runs.0[0][name] {
+    let first = |runs: &Runs, name: &str| match &runs.rows[0][name] {
         Value::String(text) => text.clone(),
         other => other.to_string(),
     };
@@ -68,7 +68,7 @@ fn readme_table(rows: &Rows) -> String {
             .map_or(String::new(), |m| format!("{:.0}", m.mean))
     };
     let lines = [
-        line("seeds", &|runs| runs.0.len().to_string()),
+        line("seeds", &|runs| runs.rows.len().to_string()),
         line("training photos; Gaussians", &|runs| {
             format!("{}; {}", first(runs, "photos"), rounded(runs, "gaussians"))
         }),

@@ -84,7 +84,7 @@ pub fn page(rows: &Rows) -> String {
         let runs = as_it_is(rows, scene)?;
         Some(vec![
             scene.to_owned(),
-            runs.0.len().to_string(),
+            runs.rows.len().to_string(),
             best.text(2),
             runs.text("miou", 2),
             runs.text("psnr", 1),

@@ -1,6 +1,6 @@
 //! The first page of the results: what fails, and all ways against the default one.
 
-use super::figures::{Mean, Runs, given, signed, total_seconds};
+use super::figures::{Mean, Runs, given, signed};
 use super::markdown::table;
 use super::plan::{BASE, Page, WAYS, Way};
 use super::rows::Rows;
@@ -103,10 +103,8 @@ fn line(rows: &Rows, way: &Way) -> Option<Vec<String>> {
             .filter_map(|(_, runs, reference)| compare(runs, reference));
         Mean::of(means.map(|mean| mean.mean))
     };
-    let ratio = |figure: &dyn Fn(&Value) -> Option<f64>| {
-        over_scenes(&|runs, reference| runs.ratio(figure, reference))
-            .map_or(String::new(), |mean| format!("x {:.2}", mean.mean))
-    };
+    let times = |mean: Option<Mean>| mean.map_or(String::new(), |m| format!("x {:.2}", m.mean));
+    let bytes = |row: &Value| row["scene_bytes"].as_f64();
     let change = |figure: &str, factor: f64, digits: usize| {
         over_scenes(&|runs, reference| runs.change(figure, reference))
             .map_or(String::new(), |mean| mean.times(factor).signed(digits))
@@ -115,8 +113,8 @@ fn line(rows: &Rows, way: &Way) -> Option<Vec<String>> {
     Some(vec![
         way.name.to_owned(),
         scenes.join(", "),
-        ratio(&total_seconds),
-        ratio(&|row| row["scene_bytes"].as_f64()),
+        times(over_scenes(&|runs, reference| runs.time_ratio(reference))),
+        times(over_scenes(&|runs, reference| runs.ratio(bytes, reference))),
         change("psnr", 1.0, 2),
         change("oracle_miou", 100.0, 1),
         change("miou", 100.0, 1),

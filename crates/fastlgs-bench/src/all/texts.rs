@@ -71,7 +71,7 @@ fn by_scene(rows: &Rows) -> Vec<Vec<String>> {
         let labels = runs.mean("labels").map_or(1.0, |mean| mean.mean);
         let line = vec![
             scene.to_owned(),
-            runs.0.len().to_string(),
+            runs.rows.len().to_string(),
             format!("{labels:.0}"),
             runs.count("right"),
             runs.text("miou", 2),
@@ -95,7 +95,7 @@ fn by_way(rows: &Rows) -> Vec<Vec<String>> {
         Some(vec![
             scene.to_owned(),
             way.name.to_owned(),
-            runs.0.len().to_string(),
+            runs.rows.len().to_string(),
             runs.count("right"),
             runs.text("miou", 3),
         ])
