@@ -73,6 +73,14 @@ impl<'a> Runs<'a> {
         (!runs.is_empty()).then_some(Self { rows: runs, timed })
     }
 
+    /// Returns the rows with the seeds of other runs.
+    pub fn with_seeds_of(mut self, other: &Self) -> Self {
+        let is_kept = |row: &&Value| other.rows.iter().any(|o| o["seed"] == row["seed"]);
+        self.rows.retain(is_kept);
+        self.timed.retain(is_kept);
+        self
+    }
+
     pub fn mean(&self, figure: &str) -> Option<Mean> {
         Mean::of(self.rows.iter().filter_map(|row| row[figure].as_f64()))
     }

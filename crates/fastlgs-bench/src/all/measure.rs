@@ -7,10 +7,12 @@ use crate::trial::{Trial, evaluate, text};
 use anyhow::{Context, Result};
 use fastlgs::{Run, SceneNotes};
 use fastlgs_core::{Gaussians, SceneFolder, fs, ply};
+use fastlgs_grid::Grid;
 use fastlgs_raster::density::State;
 use fastlgs_raster::{CpuEngine, Engine};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 /// Side to which photos are reduced, in pixels.
 const MAX_SIDE: &str = "480";
@@ -60,6 +62,7 @@ fn figures(scored: &Value, seconds: Value) -> Value {
     ] {
         row[name] = scored[name].clone();
     }
+    row["machine"] = json!(machine());
     row["query_ms"] = scored["query_ms_first"].clone();
     row
 }
@@ -89,11 +92,11 @@ impl Measure<'_> {
     /// Changes a copy of the base scene and returns its figures.
     fn changed(&self, how: How, base: &Base, trial: &Trial, seed: u64) -> Result<Value> {
         let folder = trial.scene();
-        let evaluated = || Ok(figures(&trial.eval()?, base.row["seconds"].clone()));
+        let evaluated = || Ok(figures(&trial.eval()?, Value::Null));
         match how {
             How::Make(_) | How::Photos(_) => unreachable!("these start from photos"),
             How::Train(options) => {
-                let trained = trial.train(&self.with_iterations(options), seed)?;
+                let trained = timed_training(trial, &self.with_iterations(options), seed)?;
                 let spent = seconds(
                     &base.row["seconds"]["preprocess"],
                     &trained["seconds"],
@@ -110,12 +113,15 @@ impl Measure<'_> {
                 disturb::embeddings(&folder, noise, seed + 1)?;
                 evaluated()
             }
+            How::WithoutDetector => {
+                let mut grid = Grid::load(&folder)?;
+                grid.objects.iter_mut().for_each(|o| o.detected = None);
+                grid.save(&folder)?;
+                evaluated()
+            }
             How::Baseline(method) => self.baseline(method, trial, base, seed),
             How::Format(ending) => self.exported(base, trial, ending, seed),
-            How::Compact => Ok(figures(
-                &self.compact(trial, seed)?,
-                base.row["seconds"].clone(),
-            )),
+            How::Compact => Ok(figures(&self.compact(trial, seed)?, Value::Null)),
             How::Degree(degree) => {
                 ply::write(
                     &folder.ply_path(),
@@ -143,7 +149,7 @@ impl Measure<'_> {
         seed: u64,
     ) -> Result<Value> {
         let start = ["--init", file, "--iterations", "0"];
-        let trained = trial.train(&[&start, options].concat(), seed)?;
+        let trained = timed_training(trial, &[&start, options].concat(), seed)?;
         let before = &base.row["seconds"];
         let spent = seconds(
             &before["preprocess"],
@@ -153,7 +159,8 @@ impl Measure<'_> {
         Ok(figures(&trial.eval()?, spent))
     }
 
-    /// Exports the Gaussians to a file, maps the objects to them again, and returns the figures.
+    /// Exports the Gaussians to a file, maps the objects to them again, and returns the figures. The
+    /// file has no object ids, so 2 bytes a Gaussian are added.
     fn exported(&self, base: &Base, trial: &Trial, ending: &str, seed: u64) -> Result<Value> {
         let folder = trial.scene();
         let file = folder.root.with_file_name(format!("scene.{ending}"));
@@ -162,7 +169,9 @@ impl Measure<'_> {
         let mut row = self.remapped(base, trial, text(&file), &[], seed)?;
         let length = |path: &Path| -> Result<u64> { Ok(std::fs::metadata(path)?.len()) };
         let others = row["scene_bytes"].as_u64().unwrap_or(0) - length(&folder.ply_path())?;
-        row["scene_bytes"] = json!(others + length(&file)?);
+        let ids = 2 * row["gaussians"].as_u64().unwrap_or(0);
+        row["scene_bytes"] = json!(others + length(&file)? + ids);
+        row["seconds"] = Value::Null;
         Ok(row)
     }
 
@@ -286,10 +295,19 @@ impl Measure<'_> {
         let (scene, small) = (trial.scene(), folder.path().join("small"));
         run_command(self.run, seed, "export", &[text(&scene.root), text(&small)])?;
         // The export has no photos. PSNR needs the held-out ones.
+        let to = SceneFolder::new(&small);
         for camera in scene.manifest()?.held_out(&scene.cameras()?) {
-            let photo = SceneFolder::new(&small).photo_path(&camera.name);
-            std::fs::create_dir_all(photo.parent().unwrap_or(&small))?;
-            std::fs::copy(scene.photo_path(&camera.name), photo)?;
+            let name = &camera.name;
+            for (from, to) in [
+                (scene.photo_path(name), to.photo_path(name)),
+                (scene.alpha_path(name), to.alpha_path(name)),
+                (scene.ignore_path(name), to.ignore_path(name)),
+            ] {
+                if from.is_file() {
+                    std::fs::create_dir_all(to.parent().unwrap_or(&small))?;
+                    std::fs::copy(from, to)?;
+                }
+            }
         }
         trial.eval_of(&small)
     }
@@ -299,6 +317,19 @@ impl Measure<'_> {
         let number = self.iterations.iter().flat_map(|n| ["--iterations", n]);
         options.iter().copied().chain(number).collect()
     }
+}
+
+/// Trains and returns the report. Its seconds of mapping include those of Algorithm 1, which runs
+/// while the masks are read and is part of no time in the report. They also include the loading of
+/// the scene.
+fn timed_training(trial: &Trial, options: &[&str], seed: u64) -> Result<Value> {
+    let started = Instant::now();
+    let mut report = trial.train(options, seed)?;
+    if report["mapping"] == "paper" {
+        let all = started.elapsed().as_secs_f64();
+        report["mapping_seconds"] = json!(all - report["seconds"].as_f64().unwrap_or(0.0));
+    }
+    Ok(report)
 }
 
 /// Returns the indices of the `share` of Gaussians that change the training views most.
@@ -320,7 +351,7 @@ fn most_important(folder: &SceneFolder, scene: &Gaussians, share: f64) -> Result
 }
 
 /// Returns the name of the processor and the number of threads.
-pub fn machine() -> String {
+fn machine() -> String {
     let about = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let model = about
         .lines()

@@ -137,7 +137,6 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         row["scene"] = json!(planned.scene.name);
         row["way"] = json!(planned.way.name);
         row["seed"] = json!(planned.seed);
-        row["machine"] = json!(measure::machine());
         measured.push(row.clone());
         rows.rows.push(row);
         fs::write_json(&file, &rows)?;

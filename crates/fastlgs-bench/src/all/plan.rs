@@ -41,6 +41,8 @@ pub enum How {
     Masks(MaskChange),
     /// Noise on the objects' embeddings, with this root mean square length.
     Embeddings(f32),
+    /// Objects without the detector's votes.
+    WithoutDetector,
     /// Another language field on the same Gaussians: `fastlgs-bench baseline --method`.
     Baseline(&'static str),
     /// Gaussians exported to a file of this format, and mapped again.
@@ -107,6 +109,7 @@ const fn way(
 pub const WAYS: &[Way] = {
     use How::{
         Baseline, Compact, Degree, Embeddings, Format, Kept, Make, Masks, Photos, Remap, Train,
+        WithoutDetector,
     };
     use On::{Difficult, Given, TwoPhotographed, TwoPhotographedOnce};
     use Page::{Paper, Size, Speed, Stability};
@@ -124,6 +127,13 @@ pub const WAYS: &[Way] = {
             "*quick* on a scene that is generated to be difficult",
             Difficult,
             Make(&[]),
+        ),
+        way(
+            &[Paper],
+            "quick without the detector",
+            "objects are named by their embeddings alone, as in all other ways of the paper",
+            Given,
+            WithoutDetector,
         ),
         way(
             &[Paper, Speed],
@@ -156,7 +166,7 @@ pub const WAYS: &[Way] = {
         way(
             &[Paper, Size],
             "code of 3 numbers",
-            "each object has a code of 3 numbers; a pixel belongs to the object with the nearest code",
+            "each Gaussian has the code of its smallest object, of 3 numbers; a pixel belongs to the object with the nearest code",
             Given,
             Baseline("code3"),
         ),
@@ -226,14 +236,14 @@ pub const WAYS: &[Way] = {
         way(
             &[Stability],
             "exposure 1 stop",
-            "each training photo has another brightness: normally distributed, standard deviation 1 stop",
+            "values of each training photo are multiplied by another factor, clipped at white: standard deviation 1 stop",
             TwoPhotographed,
             Photos(PhotoChange::Exposure(1.0)),
         ),
         way(
             &[Stability],
             "pose noise 4 px",
-            "each camera is turned by a random angle, 4 pixels in the mean",
+            "each training camera is turned by a random angle, 4 pixels in the mean",
             TwoPhotographed,
             Photos(PhotoChange::Pose(4.0)),
         ),
@@ -247,7 +257,7 @@ pub const WAYS: &[Way] = {
         way(
             &[Stability],
             "white balance 20 %",
-            "each training photo has another red and blue: normally distributed, standard deviation 20 %",
+            "red and blue of each training photo are multiplied by other factors: standard deviation 20 %",
             TwoPhotographed,
             Photos(PhotoChange::WhiteBalance(0.2)),
         ),
@@ -310,7 +320,7 @@ pub const WAYS: &[Way] = {
         way(
             &[Stability],
             "noise of half an embedding's length",
-            "random vectors are added to the embeddings of all objects",
+            "random vectors are added to the embeddings of all objects; votes of the detector stay",
             Given,
             Embeddings(0.5),
         ),
@@ -366,23 +376,30 @@ pub const WAYS: &[Way] = {
         way(
             &[Size],
             "code of 1 number",
-            "the same with 1 number",
+            "a code of 1 number instead",
             Given,
             Baseline("code1"),
         ),
         way(
             &[Size],
             "code of 2 numbers",
-            "the same with 2 numbers",
+            "a code of 2 numbers instead",
             Given,
             Baseline("code2"),
         ),
         way(
             &[Size],
             "code of 4 numbers",
-            "the same with 4 numbers",
+            "a code of 4 numbers instead",
             Given,
             Baseline("code4"),
+        ),
+        way(
+            &[Size],
+            "code with an axis for each object",
+            "such codes do not mix; what they lose are the larger objects at each pixel",
+            Given,
+            Baseline("codes"),
         ),
         way(
             &[Paper],

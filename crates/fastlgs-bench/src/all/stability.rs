@@ -95,7 +95,8 @@ pub fn page(rows: &Rows) -> String {
     format!(
         "# Stability\n\n{}\n{HOW_TO_READ}\n## Disturbed inputs, worst first\n\nChange of *best object* in points (hundredths of \
          IoU) against the same seed without the disturbance; *answers to texts*: of *text*. Changed photos are compared with *photos as they are*, whose own difference \
-         from *quick* is mere chance. Labelled views stay as they are. Poses of changed photos are checked and refined as usual. \
+         from *quick* is mere chance. Labelled views stay as they are, with their poses. Changed masks are mapped to Gaussians that were trained \
+         before; those of *table* have learned the exact masks. Poses of changed photos are checked and refined as usual. \
          [What each disturbance is](README.md#ways).\n\n![changes](stability.svg)\n\n{}\n## Scenes, worst \
          first\n\n{}",
         stamp(rows),

@@ -32,9 +32,13 @@ pub struct Args {
     /// `raw`: mean embedding of the whole masks that show a Gaussian, without a grid (the paper's
     /// ablation). `lerf`: embeddings of tiles at three scales; each pixel uses its most relevant
     /// scale. `langsplat`: embeddings of whole and part masks, compressed to three numbers by a
-    /// scene-wise autoencoder. `code1` to `code4`: the grid with codes of 1 to 4 numbers; each
-    /// pixel belongs to the object with the nearest code.
-    #[arg(long, value_parser = ["raw", "lerf", "langsplat", "code1", "code2", "code3", "code4"])]
+    /// scene-wise autoencoder. `code1` to `code4`: the grid with codes of 1 to 4 numbers for the
+    /// smallest object of each Gaussian; each pixel belongs to the object with the nearest code.
+    /// `codes`: the same with an axis for each object, so that codes do not mix.
+    #[arg(
+        long,
+        value_parser = ["raw", "lerf", "langsplat", "code1", "code2", "code3", "code4", "codes"]
+    )]
     method: String,
 }
 
@@ -53,6 +57,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         "raw" => PerPixel::raw(&scene, run)?,
         "lerf" => PerPixel::lerf(&scene, run)?,
         "langsplat" => PerPixel::langsplat(&scene, run)?,
+        "codes" => PerPixel::of_codes(&scene, &grid, Vectors::eye(grid.objects.len())),
         code => PerPixel::of_codes(
             &scene,
             &grid,
@@ -229,7 +234,7 @@ impl PerPixel {
         })
     }
 
-    /// Gives each Gaussian the code of its object. Gaussians without an object get the origin,
+    /// Gives each Gaussian the code of its smallest object. Gaussians without an object get the origin,
     /// which is not a code.
     fn of_codes(scene: &Scene, grid: &Grid, codes: Vectors) -> Self {
         let own = |g: usize, axis: usize| {
