@@ -193,7 +193,7 @@ pub fn labelled(rows: &Rows) -> Vec<&str> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::pages::tests::rows;
+    use super::super::rows::tests::rows;
     use super::*;
     use serde_json::json;
 

@@ -4,6 +4,7 @@
 //! All pages are made from these rows alone.
 
 mod figures;
+mod index;
 mod markdown;
 mod measure;
 mod pages;

@@ -109,7 +109,7 @@ fn readme_table(rows: &Rows) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::pages::tests::rows;
+    use super::super::rows::tests::rows;
     use super::*;
 
     #[test]

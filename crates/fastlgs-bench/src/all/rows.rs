@@ -59,8 +59,35 @@ impl Rows {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
+    use super::super::plan::{BASE, UNCHANGED};
     use super::*;
+    use serde_json::json;
+
+    fn row(scene: &str, way: &str, seed: u64, best: f64, train: f64) -> Value {
+        json!({
+            "scene": scene, "way": way, "seed": seed, "machine": "a processor", "adapter": "cpu", "size": "64x48",
+            "oracle_miou": best, "miou": 0.5 * best, "psnr": 30.0, "gaussians": 1000, "objects": 9, "photos": 35,
+            "scene_bytes": 2_000_000, "right": 2, "labels": 4, "absent_rejected": 40, "absent_texts": 40,
+            "query_ms": 20.0, "seconds": { "preprocess": 1.0, "train": train, "objects": 2.0 },
+        })
+    }
+
+    pub fn rows() -> Rows {
+        Rows {
+            version: "1.0.0, commit abc".to_owned(),
+            clip: None,
+            rows: vec![
+                row("fox", BASE, 0, 0.8, 10.0),
+                row("fox", BASE, 1, 0.9, 12.0),
+                row("fox", "standard", 0, 0.7, 40.0),
+                row("fox", UNCHANGED, 0, 0.9, 10.0),
+                row("fox", "blur 2 px", 0, 0.6, 10.0),
+                row("fox", "JPEG quality 15", 0, 0.89, 10.0),
+                row("twins", "as it is", 0, 0.3, 10.0),
+            ],
+        }
+    }
 
     #[test]
     fn rows_of_another_version_are_refused() {

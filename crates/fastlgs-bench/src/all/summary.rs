@@ -1,4 +1,4 @@
-//! The first page of the results: what fails, and all ways against the default one.
+//! What fails, and all ways against the default one.
 
 use super::figures::{Mean, Runs, given, signed};
 use super::markdown::table;
@@ -123,7 +123,7 @@ fn line(rows: &Rows, way: &Way) -> Option<Vec<String>> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::pages::tests::rows;
+    use super::super::rows::tests::rows;
     use super::*;
 
     #[test]
