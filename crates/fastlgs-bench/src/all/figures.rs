@@ -1,7 +1,7 @@
 //! Figures of rows over their seeds.
 
-use super::plan::BASE;
 use super::rows::Rows;
+use super::ways::BASE;
 use serde_json::Value;
 use std::collections::BTreeSet;
 

@@ -2,9 +2,9 @@
 
 use super::figures::{Runs, distinct, given};
 use super::markdown::{stamp, table};
-use super::plan::{BASE, WAYS, Way};
 use super::rows::Rows;
 use super::summary;
+use super::ways::{BASE, WAYS, Way};
 use fastlgs_synth::Kind;
 use std::fmt::Write as _;
 

@@ -1,6 +1,7 @@
 //! Measures a row of `fastlgs-bench all`.
 
-use super::plan::{BASE, How, Planned, SceneSource};
+use super::plan::{Planned, SceneSource};
+use super::ways::{BASE, How};
 use crate::command::run_command;
 use crate::disturb::{self, Album, PhotoChange};
 use crate::trial::{Trial, evaluate, text};

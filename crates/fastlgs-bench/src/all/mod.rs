@@ -14,6 +14,7 @@ mod rows;
 mod stability;
 mod summary;
 mod texts;
+mod ways;
 
 use crate::clip;
 use anyhow::{Context, Result, bail};
@@ -21,11 +22,12 @@ use fastlgs::Run;
 use fastlgs_core::fs;
 use fastlgs_synth::Kind;
 use measure::Measure;
-use plan::{BASE, Planned, SceneSource, WAYS};
+use plan::{Planned, SceneSource};
 use rows::Rows;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
+use ways::{BASE, WAYS};
 
 #[derive(clap::Args)]
 #[command(
@@ -222,7 +224,7 @@ mod tests {
             rows.into_iter().map(name).collect()
         };
         let of_fox = |way| ("fox".to_owned(), way, 1);
-        let expected = [BASE, plan::UNCHANGED, "blur 2 px"].map(of_fox);
+        let expected = [BASE, ways::UNCHANGED, "blur 2 px"].map(of_fox);
         assert_eq!(names(&["blur 2 px"]), expected);
         assert_eq!(names(&["none"]), []);
         assert!(names(&[]).len() > 50);

@@ -2,9 +2,9 @@
 
 use super::figures::{Mean, Runs, given, labelled};
 use super::markdown::{HOW_TO_READ, stamp, table};
-use super::plan::{BASE, Page, UNLIMITED, Way, on};
 use super::rows::Rows;
 use super::stability;
+use super::ways::{BASE, Page, UNLIMITED, Way, on};
 use super::{index, texts};
 use crate::plot::{self, Axes, Panel, Panels, Point};
 use anyhow::Result;

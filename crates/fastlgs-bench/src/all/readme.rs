@@ -2,9 +2,9 @@
 
 use super::figures::{Runs, labelled};
 use super::markdown::{stamp, table};
-use super::plan::BASE;
 use super::rows::Rows;
 use super::texts;
+use super::ways::BASE;
 use anyhow::{Context, Result};
 use fastlgs_synth::Kind;
 use serde_json::Value;

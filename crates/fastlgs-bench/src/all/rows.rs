@@ -60,7 +60,7 @@ impl Rows {
 
 #[cfg(test)]
 pub(super) mod tests {
-    use super::super::plan::{BASE, UNCHANGED};
+    use super::super::ways::{BASE, UNCHANGED};
     use super::*;
     use serde_json::json;
 

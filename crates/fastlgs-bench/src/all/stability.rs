@@ -2,8 +2,8 @@
 
 use super::figures::{Mean, Runs, distinct, labelled, signed};
 use super::markdown::{HOW_TO_READ, stamp, table};
-use super::plan::{BASE, How, Page, UNCHANGED, Way, on};
 use super::rows::Rows;
+use super::ways::{BASE, How, Page, UNCHANGED, Way, on};
 use crate::plot::{self, Cell, HeatMap};
 use anyhow::Result;
 

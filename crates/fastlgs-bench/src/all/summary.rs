@@ -2,10 +2,10 @@
 
 use super::figures::{Mean, Runs, given, signed};
 use super::markdown::table;
-use super::plan::{BASE, Page, WAYS, Way};
 use super::rows::Rows;
 use super::stability;
 use super::texts;
+use super::ways::{BASE, Page, WAYS, Way};
 use serde_json::Value;
 use std::fmt::Write as _;
 

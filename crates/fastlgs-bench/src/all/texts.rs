@@ -2,8 +2,8 @@
 
 use super::figures::{Mean, Runs, labelled};
 use super::markdown::{stamp, table};
-use super::plan::{BASE, WAYS, Way};
 use super::rows::Rows;
+use super::ways::{BASE, WAYS, Way};
 use fastlgs_synth::Kind;
 use std::fmt::Write as _;
 
