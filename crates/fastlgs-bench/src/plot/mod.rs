@@ -54,8 +54,34 @@ fn register_font() {
     });
 }
 
-/// Height of a note below a chart, in pixels.
-const NOTE: u32 = 20;
+/// Height of a line of the note below a chart, in pixels.
+const NOTE_LINE: u32 = 14;
+
+/// Splits a note into lines that fit into a width in pixels.
+fn note_lines(note: &str, width: u32) -> Vec<String> {
+    // A letter of the note is at most 6 pixels wide in the mean.
+    let letters = (width as usize).saturating_sub(16) / 6;
+    let mut lines = vec![String::new()];
+    for word in note.split(' ') {
+        let line = lines.last_mut().expect("a line");
+        if line.is_empty() {
+            line.push_str(word);
+        } else if line.len() + 1 + word.len() <= letters {
+            *line += " ";
+            *line += word;
+        } else {
+            lines.push(word.to_owned());
+        }
+    }
+    lines
+}
+
+/// Returns the size of a drawing with its note, in pixels.
+fn size_with_note(drawing: &impl Drawing, note: &str) -> (u32, u32) {
+    let (width, height) = drawing.size();
+    let lines = note_lines(note, width).len() as u32;
+    (width, height + NOTE_LINE * lines + 6)
+}
 
 /// Returns a drawing as SVG, with a note below it.
 ///
@@ -63,9 +89,8 @@ const NOTE: u32 = 20;
 /// The drawing fails.
 pub fn svg(drawing: &impl Drawing, note: &str) -> Result<String> {
     register_font();
-    let (width, height) = drawing.size();
     let mut svg = String::new();
-    let canvas = SVGBackend::with_string(&mut svg, (width, height + NOTE));
+    let canvas = SVGBackend::with_string(&mut svg, size_with_note(drawing, note));
     on_white(canvas, drawing, note).map_err(failed)?;
     Ok(svg)
 }
@@ -79,12 +104,11 @@ fn failed(error: Box<dyn std::error::Error>) -> anyhow::Error {
 /// # Errors
 /// The drawing fails, or a file cannot be written.
 pub fn save(folder: &Path, name: &str, drawing: &impl Drawing) -> Result<()> {
-    let (width, height) = drawing.size();
     let svg = svg(drawing, "")?;
     fastlgs_core::fs::write_atomic(&folder.join(format!("{name}.svg")), |file| {
         std::io::Write::write_all(file, svg.as_bytes())
     })?;
-    let height = height + NOTE;
+    let (width, height) = size_with_note(drawing, "");
     let mut pixels = vec![0; (3 * width * height) as usize];
     let canvas = BitMapBackend::with_buffer(&mut pixels, (width, height));
     on_white(canvas, drawing, "").map_err(failed)?;
@@ -101,9 +125,16 @@ where
 {
     let area = backend.into_drawing_area();
     area.fill(&WHITE)?;
-    let (chart, foot) = area.split_vertically(drawing.size().1);
+    let (width, height) = drawing.size();
+    let (chart, foot) = area.split_vertically(height);
     drawing.draw(&chart)?;
-    foot.draw(&Text::new(note.to_owned(), (8, 2), (FONT, 10)))?;
+    for (k, line) in note_lines(note, width).into_iter().enumerate() {
+        foot.draw(&Text::new(
+            line,
+            (8, 2 + NOTE_LINE as i32 * k as i32),
+            (FONT, 10),
+        ))?;
+    }
     Ok(area.present()?)
 }
 
@@ -124,6 +155,15 @@ fn titled<'a, 'b, DB: DrawingBackend>(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_note_is_split_into_lines_that_fit() {
+        assert_eq!(
+            note_lines("one two three", 16 + 6 * 7),
+            ["one two", "three"]
+        );
+        assert_eq!(note_lines("", 100), [""]);
+    }
 
     #[test]
     fn charts_are_written_in_both_forms() {
