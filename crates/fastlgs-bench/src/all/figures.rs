@@ -55,8 +55,8 @@ impl Mean {
 /// The rows of a way on a scene, one for each seed.
 pub struct Runs<'a> {
     pub rows: Vec<&'a Value>,
-    /// The rows whose times count: those of the processor that measured the most rows, if there are
-    /// any, else all.
+    /// The rows whose times count: those of the processor that timed the most rows, if there are any,
+    /// else all.
     timed: Vec<&'a Value>,
 }
 
@@ -92,6 +92,11 @@ impl<'a> Runs<'a> {
             None => total_seconds(row),
         };
         Mean::of(self.timed.iter().filter_map(of))
+    }
+
+    /// Milliseconds of the first query of a view.
+    pub fn query_milliseconds(&self) -> Option<Mean> {
+        Mean::of(self.timed.iter().filter_map(|row| row["query_ms"].as_f64()))
     }
 
     pub fn text(&self, figure: &str, digits: usize) -> String {
@@ -154,13 +159,13 @@ fn total_seconds(row: &Value) -> Option<f64> {
     Some(stages.filter_map(Value::as_f64).sum())
 }
 
-/// Returns the processors, those with the most rows first.
+/// Returns the processors, those with the most timed rows first.
 pub fn machines(rows: &Rows) -> Vec<&str> {
     let mut found = distinct(rows, "machine");
     let count = |name: &str| {
         rows.rows
             .iter()
-            .filter(|row| row["machine"] == name)
+            .filter(|row| row["machine"] == name && row["seconds"].is_object())
             .count()
     };
     found.sort_by_key(|name| std::cmp::Reverse(count(name)));
@@ -204,6 +209,9 @@ mod tests {
         let quick = Runs::of(&rows, "fox", BASE).expect("two rows");
         assert_eq!(quick.rows.len(), 2);
         assert_eq!(quick.seconds(None), Mean::of([15.0]));
+        rows.rows[0]["query_ms"] = json!(30.0);
+        let quick = Runs::of(&rows, "fox", BASE).expect("two rows");
+        assert_eq!(quick.query_milliseconds(), Mean::of([20.0]));
         let standard = Runs::of(&rows, "fox", "standard").expect("a row");
         assert_eq!(standard.time_ratio(&quick), None);
         assert!(standard.change("oracle_miou", &quick).is_some());

@@ -36,7 +36,7 @@ pub fn all(rows: &Rows) -> Result<Vec<(String, String)>> {
         ),
         (
             "query.svg",
-            panels(rows, Page::Speed, |runs| runs.mean("query_ms"), answer),
+            panels(rows, Page::Speed, |runs| runs.query_milliseconds(), answer),
             "Accuracy of answers to texts against time: first answer in a view",
             "milliseconds",
             "answer, mean IoU",
@@ -154,7 +154,8 @@ fn speed_lines(rows: &Rows, scene: &str, fronts: [&[Panel]; 2]) -> Vec<Vec<Strin
             runs.rows.len().to_string(),
             format!("{seconds:.0}"),
             ["preprocess", "train", "objects"].map(stage).join(" + "),
-            runs.text("query_ms", 0),
+            runs.query_milliseconds()
+                .map_or(String::new(), |ms| ms.text(0)),
             runs.text("oracle_miou", 2) + mark(fronts[0]),
             runs.text("miou", 2) + mark(fronts[1]),
             runs.text("psnr", 1),
