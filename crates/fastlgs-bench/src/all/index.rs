@@ -4,7 +4,7 @@ use super::figures::{Runs, distinct, given};
 use super::markdown::{stamp, table};
 use super::rows::Rows;
 use super::summary;
-use super::ways::{BASE, WAYS, Way};
+use super::ways::{BASE, UNDETECTED, WAYS, Way};
 use fastlgs_synth::Kind;
 use std::fmt::Write as _;
 
@@ -30,7 +30,7 @@ pub fn page(rows: &Rows) -> String {
     let _ = write!(
         text,
         "\n## What fails\n\n{}\n## All ways\n\nEach against *{BASE}*, with the same seed; fewer photos \
-         against *photos as they are*. Mean over the scenes, with their range in brackets. *Time*: from posed photos to \
+         against *photos as they are*, and texts of ways without the detector of everyday classes against *{UNDETECTED}*. Mean over the scenes, with their range in brackets. *Time*: from posed photos to \
          answers. *Size*: all files that a query needs. *Best object*: IoU of the best single object, *text*: IoU of \
          the answer to a label's name, both in points (hundredths). [What each way is](#ways).\n\n{}",
         summary::failures(rows),
@@ -50,6 +50,8 @@ pub fn page(rows: &Rows) -> String {
          fastlgs-bench all --scenes {} --clip DATA/clip -o docs/results --readme README.md --device cpu\n\
          fastlgs-bench all --scenes DATA/fox --ways \"blur 2 px\" --seeds 2 -o again --device cpu\n```\n\n\
          A scene is a folder of photos with `labels/` beside them, or a kind of generated scene. \
+         The photos are public ([where](../research/evaluation.md#scenes)); the labels that were drawn on them are not part of \
+         this repository, so others can measure the generated scenes, or their own labels. \
          `DATA/clip` is a folder of CLIP embeddings for `fastlgs-bench clip`.\n",
         rows.rows.len(),
         given(rows)

@@ -23,7 +23,7 @@ pub fn stamp(rows: &Rows) -> String {
         .collect();
     let machines = machines(rows);
     let times = if machines.len() > 1 {
-        " Times are of the first processor, if it has measured them."
+        " Times are of the first processor alone where it has measured them, so they can be of fewer seeds."
     } else {
         ""
     };

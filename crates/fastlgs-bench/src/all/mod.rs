@@ -166,7 +166,8 @@ fn chosen<'a>(rows: Vec<Planned<'a>>, names: &[String]) -> Vec<Planned<'a>> {
     }
     let is_named = |row: &Planned| names.iter().any(|name| name == row.way.name);
     let needs = |row: &Planned, other: &Planned| {
-        let is_compared = [BASE, row.way.reference()].contains(&other.way.name);
+        let is_compared =
+            [BASE, row.way.reference(), row.way.text_reference()].contains(&other.way.name);
         is_compared && (&row.scene.name, row.seed) == (&other.scene.name, other.seed)
     };
     let is_kept =

@@ -64,7 +64,7 @@ pub(super) mod tests {
     use super::*;
     use serde_json::json;
 
-    fn row(scene: &str, way: &str, seed: u64, best: f64, train: f64) -> Value {
+    pub fn row(scene: &str, way: &str, seed: u64, best: f64, train: f64) -> Value {
         json!({
             "scene": scene, "way": way, "seed": seed, "machine": "a processor", "adapter": "cpu", "size": "64x48",
             "oracle_miou": best, "miou": 0.5 * best, "psnr": 30.0, "gaussians": 1000, "objects": 9, "photos": 35,

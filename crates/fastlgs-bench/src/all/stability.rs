@@ -36,7 +36,7 @@ pub fn disturbances(rows: &Rows) -> Vec<(String, Vec<Option<Mean>>)> {
 }
 
 /// Returns the undisturbed rows of a scene.
-fn as_it_is<'a>(rows: &'a Rows, scene: &str) -> Option<Runs<'a>> {
+pub fn as_it_is<'a>(rows: &'a Rows, scene: &str) -> Option<Runs<'a>> {
     Runs::of(rows, scene, "as it is").or_else(|| Runs::of(rows, scene, BASE))
 }
 
@@ -95,7 +95,7 @@ pub fn page(rows: &Rows) -> String {
     format!(
         "# Stability\n\n{}\n{HOW_TO_READ}\n## Disturbed inputs, worst first\n\nChange of *best object* in points (hundredths of \
          IoU) against the same seed without the disturbance; *answers to texts*: of *text*. Changed photos are compared with *photos as they are*, whose own difference \
-         from *quick* is mere chance. Labelled views stay as they are, with their poses. Changed masks are mapped to Gaussians that were trained \
+         from *quick* shows how large a change without a cause is. Labelled views stay as they are, with their poses. Changed masks are mapped to Gaussians that were trained \
          before; those of *table* have learned the exact masks. Poses of changed photos are checked and refined as usual. \
          [What each disturbance is](README.md#ways).\n\n![changes](stability.svg)\n\n{}\n## Scenes, worst \
          first\n\n{}",

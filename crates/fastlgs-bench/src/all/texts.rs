@@ -3,6 +3,7 @@
 use super::figures::{Mean, Runs, labelled};
 use super::markdown::{stamp, table};
 use super::rows::Rows;
+use super::stability;
 use super::ways::{BASE, WAYS, Way};
 use fastlgs_synth::Kind;
 use std::fmt::Write as _;
@@ -63,8 +64,8 @@ pub fn with_clip(rows: &Rows) -> Option<String> {
 /// Returns the lines of the scenes, worst first.
 fn by_scene(rows: &Rows) -> Vec<Vec<String>> {
     let mut lines: Vec<(f64, Vec<String>)> = Vec::new();
-    for scene in labelled(rows) {
-        let Some(runs) = Runs::of(rows, scene, BASE) else {
+    for (scene, _) in stability::scenes(rows) {
+        let Some(runs) = stability::as_it_is(rows, scene) else {
             continue;
         };
         let right = runs.mean("right").map_or(0.0, |mean| mean.mean);

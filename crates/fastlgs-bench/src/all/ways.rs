@@ -73,6 +73,28 @@ impl Way {
         }
     }
 
+    /// Name of the way whose answers to texts this one is compared with. The detector of everyday
+    /// classes is part of neither the paper nor other fields, so ways without it are compared with
+    /// its absence.
+    pub fn text_reference(&self) -> &'static str {
+        let has_detector = match self.how {
+            How::Remap(_) => false,
+            How::Baseline(method) => method.starts_with("code"),
+            How::Train(options) => !options.contains(&"like-paper"),
+            _ => true,
+        };
+        if has_detector {
+            self.reference()
+        } else {
+            UNDETECTED
+        }
+    }
+
+    /// Whether its photos have another size, so that their PSNR is that of other pixels.
+    pub fn has_other_pixels(&self) -> bool {
+        matches!(self.how, How::Make(options) if options.contains(&"--max-side"))
+    }
+
     /// Whether it is measured on scenes without labels too.
     pub fn needs_no_labels(&self) -> bool {
         self.pages.contains(&Page::Size) && !matches!(self.how, How::Baseline(_))
@@ -84,8 +106,14 @@ pub const BASE: &str = "quick";
 /// The reference of changed photos.
 pub const UNCHANGED: &str = "photos as they are";
 
+/// The default way without the detector of everyday classes.
+pub const UNDETECTED: &str = "quick without the detector";
+
+/// The field without objects that the paper compares its grid with.
+pub const MEAN_EMBEDDINGS: &str = "mean embeddings without a grid";
+
 /// Training without the automatic limit of the number of Gaussians.
-pub const UNLIMITED: &str = "at most 1000000 Gaussians";
+pub const UNLIMITED: &str = "no limit of Gaussians";
 
 const fn way(
     pages: &'static [Page],
@@ -128,8 +156,8 @@ pub const WAYS: &[Way] = {
         ),
         way(
             &[Paper],
-            "quick without the detector",
-            "objects are named by their embeddings alone, as in all other ways of the paper",
+            UNDETECTED,
+            "objects are named by their embeddings alone; all other ways of the paper lack the detector too, but *code of 3 numbers*",
             Given,
             WithoutDetector,
         ),
@@ -156,7 +184,7 @@ pub const WAYS: &[Way] = {
         ),
         way(
             &[Paper, Speed],
-            "mean embeddings without a grid",
+            MEAN_EMBEDDINGS,
             "each Gaussian has the mean embedding of its masks; each pixel is classified alone",
             Given,
             Baseline("raw"),
@@ -429,8 +457,8 @@ pub const WAYS: &[Way] = {
         ),
         way(
             &[Speed],
-            "paper",
-            "`train --preset paper`: 30,000 iterations",
+            "preset paper",
+            "`train --preset paper`: 30,000 iterations of our own training and mapping",
             TwoPhotographedOnce,
             Train(&["--preset", "paper"]),
         ),
