@@ -321,8 +321,9 @@ fn paper(rows: &Rows) -> String {
         stamp(rows),
         table_of("oracle_miou"),
         table_of("miou"),
-        summary::texts_without_grid(rows)
-            .map_or(String::new(), |text| format!("\nThe paper's grid is better than a field of embeddings, and this one is not on photos. {text}.\n")),
+        summary::texts_without_grid(rows).map_or(String::new(), |text| format!(
+            "\nThe paper's grid is better than a field of embeddings. {text}.\n"
+        )),
     )
 }
 
