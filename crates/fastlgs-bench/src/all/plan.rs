@@ -73,12 +73,13 @@ pub fn rows<'a>(scenes: &'a [SceneSource], seeds: &[u64]) -> Vec<Planned<'a>> {
     let photographed: Vec<&SceneSource> = scenes
         .iter()
         .filter(|s| s.given && s.photos.is_some() && s.labelled)
-        .take(2)
         .collect();
+    let is_among =
+        |scene: &SceneSource, first: usize| photographed.iter().take(first).any(|s| *s == scene);
     let is_on = |scene: &SceneSource, way: &Way, seed: u64| match way.on {
         On::Given => scene.given && (scene.labelled || way.needs_no_labels()),
-        On::TwoPhotographed => photographed.contains(&scene),
-        On::TwoPhotographedOnce => Some(seed) == first && photographed.contains(&scene),
+        On::Photographed(number) => is_among(scene, number),
+        On::TwoPhotographedOnce => Some(seed) == first && is_among(scene, 2),
         On::Difficult => !scene.given,
     };
     let mut rows = Vec::new();
@@ -134,5 +135,27 @@ mod tests {
         assert!(WAYS.iter().all(|way| !way.name.contains(',')));
         let of = |scene: &str| rows.iter().filter(|r| r.scene.name == scene).count();
         assert_eq!(of("twins"), 3, "difficult scenes have one way");
+    }
+
+    #[test]
+    fn ways_of_photographs_are_on_the_first_scenes() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let scenes: Vec<SceneSource> = ["fox", "office", "bonsai", "apartment"]
+            .iter()
+            .map(|name| {
+                let photos = folder.path().join(name);
+                std::fs::create_dir_all(photos.join("labels")).expect("labels");
+                SceneSource::of(photos.to_str().expect("UTF-8"))
+            })
+            .collect();
+        let rows = rows(&scenes, &[0, 1]);
+        let of = |way: &str| -> Vec<(&str, u64)> {
+            let rows = rows.iter().filter(|row| row.way.name == way);
+            rows.map(|r| (r.scene.name.as_str(), r.seed)).collect()
+        };
+        assert_eq!(of("side 240").len(), 2 * 3);
+        assert!(!of("side 240").contains(&("apartment", 0)));
+        assert_eq!(of("blur 2 px").len(), 2 * 2);
+        assert_eq!(of("preset paper"), [("fox", 0), ("office", 0)]);
     }
 }

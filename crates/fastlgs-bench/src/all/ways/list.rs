@@ -25,7 +25,7 @@ pub const WAYS: &[Way] = {
         Baseline, Compact, Degree, Embeddings, Format, Kept, Make, Masks, Photos, Remap, Train,
         WithoutDetector,
     };
-    use On::{Difficult, Given, TwoPhotographed, TwoPhotographedOnce};
+    use On::{Difficult, Given, Photographed, TwoPhotographedOnce};
     use Page::{Paper, Size, Speed, Stability};
     &[
         way(
@@ -130,77 +130,77 @@ pub const WAYS: &[Way] = {
             &[Stability],
             UNCHANGED,
             "*quick* from the prepared photos; the reference of all changed photos",
-            TwoPhotographed,
+            Photographed(3),
             Photos(PhotoChange::Unchanged),
         ),
         way(
             &[Stability, Speed],
             "half of the photos missing",
             "a random half of the training photos is removed",
-            TwoPhotographed,
+            Photographed(3),
             Photos(PhotoChange::Missing(0.5)),
         ),
         way(
             &[Stability],
             "blur 2 px",
             "each training photo is blurred by a Gaussian of 2 pixels",
-            TwoPhotographed,
+            Photographed(2),
             Photos(PhotoChange::Blur(2.0)),
         ),
         way(
             &[Stability],
             "exposure 1 stop",
             "values of each training photo are multiplied by another factor, clipped at white: standard deviation 1 stop",
-            TwoPhotographed,
+            Photographed(2),
             Photos(PhotoChange::Exposure(1.0)),
         ),
         way(
             &[Stability],
             "pose noise 4 px",
             "each training camera is turned by a random angle, 4 pixels in the mean",
-            TwoPhotographed,
+            Photographed(2),
             Photos(PhotoChange::Pose(4.0)),
         ),
         way(
             &[Stability],
             "focal length 10 % too long",
             "the stated focal length of all training photos",
-            TwoPhotographed,
+            Photographed(2),
             Photos(PhotoChange::Focal(0.1)),
         ),
         way(
             &[Stability],
             "white balance 20 %",
             "red and blue of each training photo are multiplied by other factors: standard deviation 20 %",
-            TwoPhotographed,
+            Photographed(2),
             Photos(PhotoChange::WhiteBalance(0.2)),
         ),
         way(
             &[Stability],
             "JPEG quality 15",
             "each training photo is compressed",
-            TwoPhotographed,
+            Photographed(2),
             Photos(PhotoChange::Jpeg(15)),
         ),
         way(
             &[Stability],
             "photos in random order",
             "the training photos are renamed",
-            TwoPhotographed,
+            Photographed(2),
             Photos(PhotoChange::Shuffled),
         ),
         way(
             &[Stability, Speed],
             "three quarters of the photos missing",
             "a random quarter of the training photos stays",
-            TwoPhotographed,
+            Photographed(3),
             Photos(PhotoChange::Missing(0.75)),
         ),
         way(
             &[Stability],
             "masks of whole objects only",
             "`preprocess --levels whole`: no masks of parts",
-            TwoPhotographed,
+            Photographed(2),
             Make(&["--levels", "whole"]),
         ),
         way(
@@ -249,7 +249,7 @@ pub const WAYS: &[Way] = {
             &[Speed],
             "side 240",
             "photos of at most 240 pixels a side",
-            TwoPhotographed,
+            Photographed(3),
             Make(&["--max-side", "240"]),
         ),
         way(
@@ -270,7 +270,7 @@ pub const WAYS: &[Way] = {
             &[Speed],
             "side 720",
             "photos of at most 720 pixels a side",
-            TwoPhotographed,
+            Photographed(3),
             Make(&["--max-side", "720"]),
         ),
         way(

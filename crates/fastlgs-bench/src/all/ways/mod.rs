@@ -19,9 +19,9 @@ pub enum Page {
 pub enum On {
     /// All given scenes. Those without labels have only the ways of [`Page::Size`].
     Given,
-    /// The first two given scenes with photos.
-    TwoPhotographed,
-    /// The same with the first seed alone: 30,000 iterations take most of an hour.
+    /// The first given scenes with photos and labels: this number of them.
+    Photographed(usize),
+    /// The first two of them, with the first seed alone: 30,000 iterations take most of an hour.
     TwoPhotographedOnce,
     /// Scenes generated to be difficult, which need not be given.
     Difficult,
