@@ -189,10 +189,10 @@ fn speed(rows: &Rows) -> String {
          accurate. Fields without objects (*mean embeddings*, *like LangSplat*, *like LERF*) are not the authors' programs, and use \
          the built-in encoder instead of CLIP. They have no best object, no detector of everyday classes, and never refuse a text; the time of their queries is that of rendering alone. \
          Compare their texts with those of [*quick without the detector*](paper.md#answer-to-a-text). The seconds of *preset like-paper* lack \
-         those of Algorithm 1, which takes less than a minute in *paper's mapping*. \
+         those of Algorithm 1, which are among those of the objects in *paper's mapping*. \
          PSNR of *side 240* and *side 720* is that of photos of this side; with photos missing, it is that of the labelled views \
-         alone. Ways with photos missing start from prepared photos, so their seconds lack the repair of bonsai's \
-         poses (36 s with all photos). [What each way is](README.md#ways).\n\n![accuracy against seconds](speed.svg)\n\n\
+         alone. Ways with photos missing start from prepared photos, so their seconds lack any repair of \
+         poses. [What each way is](README.md#ways).\n\n![accuracy against seconds](speed.svg)\n\n\
          ![accuracy of answers against seconds](speed-texts.svg)\n\n\
          ![accuracy of answers against milliseconds of a query](query.svg)\n\n{}",
         stamp(rows),
