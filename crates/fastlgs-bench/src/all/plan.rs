@@ -70,16 +70,19 @@ pub fn difficult(given: &[SceneSource]) -> Vec<SceneSource> {
 pub fn rows<'a>(scenes: &'a [SceneSource], seeds: &[u64]) -> Vec<Planned<'a>> {
     let seeds: BTreeSet<u64> = seeds.iter().copied().collect();
     let first = seeds.first().copied();
-    let photographed: Vec<&SceneSource> = scenes
+    let labelled: Vec<&SceneSource> = scenes.iter().filter(|s| s.given && s.labelled).collect();
+    let photographed: Vec<&SceneSource> = labelled
         .iter()
-        .filter(|s| s.given && s.photos.is_some() && s.labelled)
+        .copied()
+        .filter(|s| s.photos.is_some())
         .collect();
-    let is_among =
-        |scene: &SceneSource, first: usize| photographed.iter().take(first).any(|s| *s == scene);
+    let is_among = |scene: &SceneSource, scenes: &[&SceneSource], number: usize| {
+        scenes.iter().take(number).any(|s| *s == scene)
+    };
     let is_on = |scene: &SceneSource, way: &Way, seed: u64| match way.on {
         On::Given => scene.given && (scene.labelled || way.needs_no_labels()),
-        On::Photographed(number) => is_among(scene, number),
-        On::TwoPhotographedOnce => Some(seed) == first && is_among(scene, 2),
+        On::Photographed(number) => is_among(scene, &photographed, number),
+        On::LabelledOnce(number) => Some(seed) == first && is_among(scene, &labelled, number),
         On::Difficult => !scene.given,
     };
     let mut rows = Vec::new();
@@ -140,7 +143,7 @@ mod tests {
     #[test]
     fn ways_of_photographs_are_on_the_first_scenes() {
         let folder = tempfile::tempdir().expect("a folder");
-        let scenes: Vec<SceneSource> = ["fox", "office", "bonsai", "apartment"]
+        let mut scenes: Vec<SceneSource> = ["fox", "office", "bonsai", "apartment"]
             .iter()
             .map(|name| {
                 let photos = folder.path().join(name);
@@ -148,6 +151,7 @@ mod tests {
                 SceneSource::of(photos.to_str().expect("UTF-8"))
             })
             .collect();
+        scenes.insert(3, SceneSource::of("table"));
         let rows = rows(&scenes, &[0, 1]);
         let of = |way: &str| -> Vec<(&str, u64)> {
             let rows = rows.iter().filter(|row| row.way.name == way);
@@ -156,6 +160,8 @@ mod tests {
         assert_eq!(of("side 240").len(), 2 * 3);
         assert!(!of("side 240").contains(&("apartment", 0)));
         assert_eq!(of("blur 2 px").len(), 2 * 2);
-        assert_eq!(of("preset paper"), [("fox", 0), ("office", 0)]);
+        assert_eq!(of("preset like-paper"), [("fox", 0), ("office", 0)]);
+        let scenes = ["fox", "office", "bonsai", "table"];
+        assert_eq!(of("preset paper"), scenes.map(|scene| (scene, 0)));
     }
 }

@@ -25,7 +25,7 @@ pub const WAYS: &[Way] = {
         Baseline, Compact, Degree, Embeddings, Format, Kept, Make, Masks, Photos, Remap, Train,
         WithoutDetector,
     };
-    use On::{Difficult, Given, Photographed, TwoPhotographedOnce};
+    use On::{Difficult, Given, LabelledOnce, Photographed};
     use Page::{Paper, Size, Speed, Stability};
     &[
         way(
@@ -340,14 +340,14 @@ pub const WAYS: &[Way] = {
             &[Paper, Speed],
             "preset like-paper",
             "`train --preset like-paper`: Algorithm 1, and codes trained with the colours for 30,000 iterations",
-            TwoPhotographedOnce,
+            LabelledOnce(2),
             Train(&["--preset", "like-paper"]),
         ),
         way(
             &[Speed],
             "preset paper",
             "`train --preset paper`: 30,000 iterations of our own training and mapping",
-            TwoPhotographedOnce,
+            LabelledOnce(4),
             Train(&["--preset", "paper"]),
         ),
     ]
