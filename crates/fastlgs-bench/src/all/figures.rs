@@ -109,6 +109,12 @@ impl<'a> Runs<'a> {
         self.text(figure, 1).replace(".0", "")
     }
 
+    /// Number of rows with seconds that count.
+    pub fn timed(&self) -> usize {
+        let has_seconds = |row: &&&Value| row["seconds"].is_object();
+        self.timed.iter().filter(has_seconds).count()
+    }
+
     /// A comparison with the rows of other runs that have the same seed.
     fn against(
         &self,
@@ -141,6 +147,18 @@ impl<'a> Runs<'a> {
             is_comparable.then_some(ratio)
         })
     }
+}
+
+/// Formats a number of seeds, or the smallest and the largest of several scenes.
+pub fn seeds<'a>(runs: impl IntoIterator<Item = &'a Runs<'a>>) -> String {
+    let count = Mean::of(runs.into_iter().map(|runs| runs.rows.len() as f64));
+    count.map_or(String::new(), |count| {
+        if count.low == count.high {
+            format!("{:.0}", count.low)
+        } else {
+            format!("{:.0} to {:.0}", count.low, count.high)
+        }
+    })
 }
 
 /// Formats a number with its sign; without one if it is rounded to zero.

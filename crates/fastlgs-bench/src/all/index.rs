@@ -4,14 +4,15 @@ use super::figures::{Runs, distinct, given};
 use super::markdown::{stamp, table};
 use super::rows::Rows;
 use super::summary;
-use super::ways::{BASE, UNDETECTED, WAYS, Way};
+use super::ways::{BASE, PAPER_MAPPING, UNCHANGED, UNDETECTED, WAYS, Way};
 use fastlgs_synth::Kind;
 use std::fmt::Write as _;
 
 pub fn page(rows: &Rows) -> String {
     let mut text = format!(
         "# Results\n\n{}\nPhotos have at most 480 pixels a side; every eighth view is held out. Constants of the program were \
-         chosen by these labels of fox, office, bonsai and apartment, so figures of these scenes are figures of development.\n\n",
+         chosen by these labels of fox, office, bonsai and apartment, so figures of these scenes are figures of development. The version is that of the measured program; \
+         what measures it has changed since ([rules](../research/evaluation.md#the-benches)).\n\n",
         stamp(rows)
     );
     for (page, about) in [
@@ -29,8 +30,9 @@ pub fn page(rows: &Rows) -> String {
     text += "- [peers](../research/peers.md): OpenSplat and Brush, measured once by hand\n";
     let _ = write!(
         text,
-        "\n## What fails\n\n{}\n## All ways\n\nEach against *{BASE}*, with the same seed; fewer photos \
-         against *photos as they are*, and texts of ways without the detector of everyday classes against *{UNDETECTED}*. Mean over the scenes, with their range in brackets. *Time*: from posed photos to \
+        "\n## What fails\n\n{}\n## All ways\n\nEach against *{BASE}*, with the same seed. Fewer photos are compared \
+         with *{UNCHANGED}*, changes of Algorithm 1 with *{PAPER_MAPPING}*, and texts of other ways without the detector of everyday classes \
+         with *{UNDETECTED}*. Mean over the scenes, with their range in brackets. *Time*: from posed photos to \
          answers. *Size*: all files that a query needs. *Best object*: IoU of the best single object, *text*: IoU of \
          the answer to a label's name, both in points (hundredths). [What each way is](#ways).\n\n{}",
         summary::failures(rows),
@@ -48,10 +50,10 @@ pub fn page(rows: &Rows) -> String {
         "\n## Make them again\n\n[rows.json](rows.json) has {} rows. One command makes all that are missing, and \
          all pages. The second makes one row again, and those that it is compared with, in another folder:\n\n```sh\n\
          fastlgs-bench all --scenes {} --clip DATA/clip -o docs/results --readme README.md --device cpu\n\
-         fastlgs-bench all --scenes DATA/fox --ways \"blur 2 px\" --seeds 2 -o again --device cpu\n```\n\n\
+         fastlgs-bench all --scenes table --ways \"40 % of the masks split\" --seeds 2 -o again --device cpu\n```\n\n\
          A scene is a folder of photos with `labels/` beside them, or a kind of generated scene. \
          The photos are public ([where](../research/evaluation.md#scenes)); the labels that were drawn on them are not part of \
-         this repository, so others can measure the generated scenes, or their own labels. \
+         this repository. So anyone can measure the generated scenes, as the second command does, or other photos with labels. \
          `DATA/clip` is a folder of CLIP embeddings for `fastlgs-bench clip`.\n",
         rows.rows.len(),
         given(rows)

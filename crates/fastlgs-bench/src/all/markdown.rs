@@ -40,7 +40,9 @@ pub fn stamp(rows: &Rows) -> String {
     )
 }
 
-pub const HOW_TO_READ: &str = "Means over the seeds, with their range in brackets. *Best object*: IoU of the best \
-single object, mean over the labels of held-out views. *Text*: IoU of the answer to the label's name. \
-*Seconds*: from posed photos to answers. Poses that contradict the photos are repaired in this time \
-([scenes](../research/evaluation.md#scenes)).\n";
+/// How to read the figures of all pages.
+pub const MEANS: &str = "Means over the seeds, with their range in brackets. *Best object*: IoU of the best single object, \
+mean over the labels of held-out views.";
+/// How to read the column *text*.
+pub const TEXT: &str =
+    " *Text*: IoU of the answer to the label's name, mean over the labels; no answer is 0.";

@@ -1,12 +1,12 @@
 //! Tables and charts of `fastlgs-bench all`, made from its rows alone.
 
-use super::figures::{Mean, Runs, given, labelled};
-use super::markdown::{HOW_TO_READ, stamp, table};
+use super::figures::{self, Mean, Runs, given, labelled};
+use super::markdown::{MEANS, TEXT, stamp, table};
 use super::rows::Rows;
 use super::stability;
-use super::ways::{BASE, Page, UNLIMITED, Way, on};
+use super::ways::{BASE, Page, UNDETECTED, UNLIMITED, Way, on};
 use super::{index, summary, texts};
-use crate::plot::{self, Axes, Panel, Panels, Point};
+use crate::plot::{self, Axes, Marker, Panel, Panels, Point};
 use anyhow::Result;
 
 /// Returns name and text of all files.
@@ -22,35 +22,47 @@ pub fn all(rows: &Rows) -> Result<Vec<(String, String)>> {
     let charts = [
         (
             "speed.svg",
-            panels(rows, Page::Speed, total, best),
+            panels(rows, Page::Speed, total, best, circle),
             "Accuracy against time: from posed photos to answers",
             "seconds",
             "best object, mean IoU",
         ),
         (
             "speed-texts.svg",
-            panels(rows, Page::Speed, total, answer),
-            "Accuracy of answers to texts against time: from posed photos to answers",
+            panels(rows, Page::Speed, total, answer, by_detector),
+            "Answers to texts against time: from posed photos to answers (triangles: without the detector of everyday classes)",
             "seconds",
             "answer, mean IoU",
         ),
         (
             "query.svg",
-            panels(rows, Page::Speed, |runs| runs.query_milliseconds(), answer),
-            "Accuracy of answers to texts against time: first answer in a view (fields without objects: its rendering)",
+            panels(
+                rows,
+                Page::Speed,
+                |runs| runs.query_milliseconds(),
+                answer,
+                by_detector,
+            ),
+            "Answers to texts against time: first answer in a view; fields without objects: its rendering (triangles: no detector)",
             "milliseconds",
             "answer, mean IoU",
         ),
         (
             "size.svg",
-            panels(rows, Page::Size, megabytes, best),
+            panels(rows, Page::Size, megabytes, best, circle),
             "Accuracy against size",
             "megabytes",
             "best object, mean IoU",
         ),
         (
             "size-psnr.svg",
-            panels(rows, Page::Size, megabytes, |runs| runs.mean("psnr")),
+            panels(
+                rows,
+                Page::Size,
+                megabytes,
+                |runs| runs.mean("psnr"),
+                circle,
+            ),
             "Colour against size",
             "megabytes",
             "PSNR of held-out views, dB",
@@ -83,27 +95,49 @@ fn megabytes(runs: &Runs) -> Option<Mean> {
     Some(runs.mean("scene_bytes")?.times(1e-6))
 }
 
-/// Returns a panel for each given scene: the ways of these pages, with their Pareto front.
+/// The marker of charts of best objects, which are the same without the detector.
+fn circle(way: &Way) -> Option<Marker> {
+    (way.name != UNDETECTED).then_some(Marker::Circle)
+}
+
+/// The marker of charts of answers to texts.
+fn by_detector(way: &Way) -> Option<Marker> {
+    Some(if way.has_detector() {
+        Marker::Circle
+    } else {
+        Marker::Triangle
+    })
+}
+
+/// Returns a panel for each given scene: the ways of a page, with their Pareto front. Ways that start
+/// from prepared photos are not on it, because their seconds lack any repair of poses.
 fn panels(
     rows: &Rows,
     page: Page,
     x: impl Fn(&Runs) -> Option<Mean>,
     y: impl Fn(&Runs) -> Option<Mean>,
+    marker: impl Fn(&Way) -> Option<Marker>,
 ) -> Vec<Panel> {
     let point = |scene: &str, way: &Way| {
         let runs = Runs::of(rows, scene, way.name)?;
-        let y = y(&runs)?;
+        let (x, y) = (x(&runs)?, y(&runs)?);
         Some(Point {
             name: way.name.to_owned(),
-            x: x(&runs)?.mean,
+            x: x.mean,
             y: y.mean,
-            range: (y.low, y.high),
+            ranges: [(x.low, x.high), (y.low, y.high)],
+            marker: marker(way)?,
             front: false,
         })
     };
     let panel = |scene: &str| {
-        let mut points: Vec<Point> = on(page).filter_map(|way| point(scene, way)).collect();
+        let of = |prepared: bool| -> Vec<Point> {
+            let ways = on(page).filter(|way| way.starts_prepared() == prepared);
+            ways.filter_map(|way| point(scene, way)).collect()
+        };
+        let mut points = of(false);
         mark_front(&mut points);
+        points.extend(of(true));
         Panel {
             name: scene.to_owned(),
             points,
@@ -135,14 +169,14 @@ fn speed_lines(rows: &Rows, scene: &str, fronts: [&[Panel]; 2]) -> Vec<Vec<Strin
             .into_iter()
             .any(|point| point.front && point.name == name)
     };
-    let mut timed: Vec<(f64, &str, Runs)> = on(Page::Speed)
+    let mut timed: Vec<(Mean, &str, Runs)> = on(Page::Speed)
         .filter_map(|way| {
             let runs = Runs::of(rows, scene, way.name)?;
-            Some((total(&runs)?.mean, way.name, runs))
+            Some((total(&runs)?, way.name, runs))
         })
         .collect();
-    timed.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let line = |(seconds, name, runs): &(f64, &str, Runs)| {
+    timed.sort_by(|a, b| a.0.mean.total_cmp(&b.0.mean));
+    let line = |(seconds, name, runs): &(Mean, &str, Runs)| {
         let stage = |stage: &str| {
             runs.seconds(Some(stage))
                 .map_or(String::new(), |s| format!("{:.0}", s.mean))
@@ -152,7 +186,8 @@ fn speed_lines(rows: &Rows, scene: &str, fronts: [&[Panel]; 2]) -> Vec<Vec<Strin
             scene.to_owned(),
             (*name).to_owned(),
             runs.rows.len().to_string(),
-            format!("{seconds:.0}"),
+            runs.timed().to_string(),
+            seconds.text(0),
             ["preprocess", "train", "objects"].map(stage).join(" + "),
             runs.query_milliseconds()
                 .map_or(String::new(), |ms| ms.text(0)),
@@ -166,8 +201,8 @@ fn speed_lines(rows: &Rows, scene: &str, fronts: [&[Panel]; 2]) -> Vec<Vec<Strin
 }
 
 fn speed(rows: &Rows) -> String {
-    let of_best = panels(rows, Page::Speed, total, best);
-    let of_answers = panels(rows, Page::Speed, total, answer);
+    let of_best = panels(rows, Page::Speed, total, best, circle);
+    let of_answers = panels(rows, Page::Speed, total, answer, by_detector);
     let scenes = labelled(rows).into_iter();
     let lines: Vec<Vec<String>> = scenes
         .flat_map(|scene| speed_lines(rows, scene, [&of_best, &of_answers]))
@@ -176,6 +211,7 @@ fn speed(rows: &Rows) -> String {
         "scene",
         "way",
         "seeds",
+        "timed",
         "seconds",
         "preprocess + train + objects",
         "ms of a query",
@@ -185,14 +221,17 @@ fn speed(rows: &Rows) -> String {
         "Gaussians",
     ];
     format!(
-        "# Speed against accuracy\n\n{}\n{HOW_TO_READ}An asterisk marks the front: no other way is as fast and as \
-         accurate. Fields without objects (*mean embeddings*, *like LangSplat*, *like LERF*) are not the authors' programs, and use \
-         the built-in encoder instead of CLIP. They have no best object, no detector of everyday classes, and never refuse a text; the time of their queries is that of rendering alone. \
-         Compare their texts with those of [*quick without the detector*](paper.md#answer-to-a-text). The seconds of *preset like-paper* lack \
-         those of Algorithm 1, which are among those of the objects in *paper's mapping*. \
-         PSNR of *side 240* and *side 720* is that of photos of this side; with photos missing, it is that of the labelled views \
-         alone. Ways with photos missing start from prepared photos, so their seconds lack any repair of \
-         poses. [What each way is](README.md#ways).\n\n![accuracy against seconds](speed.svg)\n\n\
+        "# Speed against accuracy\n\n{}\n{MEANS}{TEXT} *Seconds*: from posed photos to answers, repair of wrong poses \
+         included ([scenes](../research/evaluation.md#scenes)); *timed*: the number of their seeds. [What each way is](README.md#ways).\n\n\
+         An asterisk marks the front: no other way is as fast and as accurate. Each panel of the charts has its own axes.\n\n\
+         - Ways with photos missing start from prepared photos, so their seconds lack any repair of poses, and they are not on the front.\n\
+         - Fields without objects (*mean embeddings*, *like LangSplat*, *like LERF*) are not the authors' programs and use the built-in \
+         encoder instead of CLIP. They have no best object. The time of their queries is that of rendering alone.\n\
+         - Neither they nor the paper's mapping have the detector of everyday classes: compare their texts with those of *{UNDETECTED}*. \
+         The fields and *preset like-paper* refuse no text.\n\
+         - The seconds of *preset like-paper* lack those of Algorithm 1, which are among the objects' in *paper's mapping*.\n\
+         - PSNR of *side 240* and *side 720* is that of photos of this side; with photos missing, it is that of the labelled views alone.\n\n\
+         ![accuracy against seconds](speed.svg)\n\n\
          ![accuracy of answers against seconds](speed-texts.svg)\n\n\
          ![accuracy of answers against milliseconds of a query](query.svg)\n\n{}",
         stamp(rows),
@@ -232,7 +271,7 @@ fn size(rows: &Rows) -> String {
         "best object",
     ];
     format!(
-        "# Size against accuracy\n\n{}\n{HOW_TO_READ}*MB*: all files of the scene that a query needs; SPZ and SOG with 2 bytes a Gaussian for the objects.\n\n![accuracy against \
+        "# Size against accuracy\n\n{}\n{MEANS} *MB*: all files of the scene that a query needs; SPZ and SOG with 2 bytes a Gaussian for the objects.\n\n![accuracy against \
          size](size.svg)\n\n![colour against size](size-psnr.svg)\n\n{}{}",
         stamp(rows),
         table(&head, &lines),
@@ -270,9 +309,9 @@ fn limits(rows: &Rows) -> String {
         "points of best object gained",
     ];
     format!(
-        "\n## Where the automatic limit stops\n\nThe limit removes the Gaussians that \
-         together add a twentieth to the remaining squared error of the training views ([how it \
-         works](../how-it-works.md)). What all of them gain in held-out views:\n\n{}",
+        "\n## Where the automatic limit stops\n\nWhile training, the limit removes twice the Gaussians that \
+         together add a twentieth to the remaining squared error of the training views. It also allows at most one for 20 pixels of \
+         these views, and at most 200,000 with preset quick ([how it works](../how-it-works.md)). What all of them gain in held-out views:\n\n{}",
         table(&head, &lines)
     )
 }
@@ -306,24 +345,27 @@ fn paper(rows: &Rows) -> String {
             };
             let cells: Vec<String> = scenes.iter().map(of).collect();
             if cells.iter().any(|text| !text.is_empty()) {
-                lines.push([vec![way.name.to_owned()], cells].concat());
+                let runs: Vec<Runs> = scenes
+                    .iter()
+                    .filter_map(|scene| Runs::of(rows, scene, way.name))
+                    .collect();
+                lines.push([vec![way.name.to_owned(), figures::seeds(&runs)], cells].concat());
             }
         }
-        let head: Vec<&str> = std::iter::once("way")
-            .chain(scenes.iter().copied())
-            .collect();
+        let head = [&["way", "seeds"], scenes.as_slice()].concat();
         table(&head, &lines)
     };
     format!(
-        "# The paper's ablations\n\n{}\n{HOW_TO_READ}Generated scenes have exact masks, photos those of the built-in \
-         segmenter. The paper has SAM's masks and CLIP's embeddings. With the built-in encoder, masks of one object are less \
-         similar, so theta is 0.7 instead of the paper's 0.95. Only *quick* and *code of 3 numbers* have the detector of everyday classes. All but *quick* and *preset like-paper* keep the Gaussians of \
-         *quick*. [What each way is](README.md#ways).\n\n## Best object\n\n{}\n## Answer to a text\n\n{}{PAPER_FIGURES}{}",
+        "# The paper's ablations\n\n{}\n{MEANS}{TEXT} [What each way is](README.md#ways).\n\n\
+         Generated scenes have exact masks, photos those of the built-in segmenter. The paper has SAM's masks and CLIP's \
+         embeddings. With the built-in encoder, masks of one object are less similar, so theta is 0.7 instead of the paper's \
+         0.95. Only *quick* and *code of 3 numbers* have the detector of everyday classes. All but *quick* and *preset like-paper* keep \
+         the Gaussians of *quick*. *Preset like-paper* refuses no text.\n\n## Best object\n\n{}\n## Answer to a text\n\n{}{PAPER_FIGURES}{}",
         stamp(rows),
         table_of("oracle_miou"),
         table_of("miou"),
         summary::texts_without_grid(rows).map_or(String::new(), |text| format!(
-            "\nThe paper's grid is better than a field of embeddings. {text}.\n"
+            "\nThe paper's grid is better than a field of embeddings. {text}\n"
         )),
     )
 }
@@ -352,8 +394,9 @@ mod tests {
             );
         }
         assert!(
-            of("speed.md")
-                .contains("| fox | quick | 2 | 14 | 1 + 11 + 2 | 20 | 0.85 (0.80 to 0.90) * |"),
+            of("speed.md").contains(
+                "| fox | quick | 2 | 2 | 14 (13 to 15) | 1 + 11 + 2 | 20 | 0.85 (0.80 to 0.90) * |"
+            ),
             "{}",
             of("speed.md")
         );
@@ -380,7 +423,8 @@ mod tests {
             name: String::new(),
             x,
             y,
-            range: (y, y),
+            ranges: [(x, x), (y, y)],
+            marker: Marker::Circle,
             front: false,
         };
         let mut points = [

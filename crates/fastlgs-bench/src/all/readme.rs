@@ -25,13 +25,12 @@ const TEXTS: [&str; 2] = [
 /// # Errors
 /// A marker is missing.
 pub fn with_figures(readme: &str, rows: &Rows) -> Result<String> {
-    let sentence = |text: Option<String>| {
-        text.map_or(String::new(), |mut text| {
-            text[..1].make_ascii_uppercase();
-            text + ".\n"
-        })
-    };
-    let about_texts = sentence(texts::answered(rows)) + &sentence(texts::with_clip(rows));
+    let sentences = [texts::answered(rows), texts::with_clip(rows)];
+    let about_texts: String = sentences
+        .into_iter()
+        .flatten()
+        .map(|text| text + "\n")
+        .collect();
     let readme = replaced(readme, TEXTS, &about_texts)?;
     replaced(&readme, FIGURES, &readme_table(rows))
 }
@@ -101,7 +100,8 @@ fn readme_table(rows: &Rows) -> String {
         .chain(titles.iter().map(String::as_str))
         .collect();
     format!(
-        "{}\n{}\n![accuracy against seconds from posed photos to answers](docs/results/speed.svg)\n",
+        "{}\n{}\n![accuracy of objects against seconds](docs/results/speed.svg)\n\n\
+         ![accuracy of answers to texts against seconds](docs/results/speed-texts.svg)\n",
         stamp(rows),
         table(&head, &lines)
     )

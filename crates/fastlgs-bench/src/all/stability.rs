@@ -1,7 +1,7 @@
 //! The page of disturbed inputs and difficult scenes.
 
 use super::figures::{Mean, Runs, distinct, labelled, signed};
-use super::markdown::{HOW_TO_READ, stamp, table};
+use super::markdown::{MEANS, TEXT, stamp, table};
 use super::rows::Rows;
 use super::ways::{BASE, How, Page, UNCHANGED, Way, on};
 use crate::plot::{self, Cell, HeatMap};
@@ -93,12 +93,12 @@ pub fn page(rows: &Rows) -> String {
     };
     let difficult: Vec<Vec<String>> = self::scenes(rows).into_iter().filter_map(line).collect();
     format!(
-        "# Stability\n\n{}\n{HOW_TO_READ}\n## Disturbed inputs, worst first\n\nChange of *best object* in points (hundredths of \
-         IoU) against the same seed without the disturbance; *answers to texts*: of *text*. Changed photos are compared with *photos as they are*, whose own difference \
-         from *quick* shows how large a change without a cause is. Labelled views stay as they are, with their poses. Changed masks are mapped to Gaussians that were trained \
-         before; those of *table* have learned the exact masks. Poses of changed photos are checked and refined as usual. \
+        "# Stability\n\n{}\n{MEANS}{TEXT}\n\n## Disturbed inputs, worst first\n\nChange of *best object* in points (hundredths of \
+         IoU) against the same seed without the disturbance; *answers to texts*: of *text*. Changed photos are compared with *photos as they are*. Its own difference \
+         from *quick* is that of two runs. Poses of changed photos are checked and refined as usual; labelled views stay as they are, with their poses. \
+         Changed masks are mapped to Gaussians that were trained before, those of *table* with the exact masks. \
          [What each disturbance is](README.md#ways).\n\n![changes](stability.svg)\n\n{}\n## Scenes, worst \
-         first\n\n{}",
+         first\n\nWhere [labels join several objects](../research/evaluation.md#scenes), as many of the apartment do, no single object covers them.\n\n{}",
         stamp(rows),
         table(&head, &lines),
         table(

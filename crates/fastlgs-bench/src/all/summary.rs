@@ -1,11 +1,11 @@
 //! What fails, and all ways against the default one.
 
-use super::figures::{Mean, Runs, given, labelled, signed};
+use super::figures::{self, Mean, Runs, given, labelled, signed};
 use super::markdown::table;
 use super::rows::Rows;
 use super::stability;
 use super::texts;
-use super::ways::{BASE, MEAN_EMBEDDINGS, Page, UNDETECTED, WAYS, Way};
+use super::ways::{BASE, MEAN_EMBEDDINGS, Page, UNCHANGED, UNDETECTED, WAYS, Way};
 use serde_json::Value;
 use std::fmt::Write as _;
 
@@ -19,11 +19,9 @@ const FEW_POINTS: f64 = 2.0;
 /// Returns a list of what fails, and of what does not.
 pub fn failures(rows: &Rows) -> String {
     let mut text = String::new();
-    if let Some(answered) = texts::answered(rows) {
-        let _ = writeln!(text, "- Texts: {answered}.");
-    }
-    if let Some(lost) = texts_without_grid(rows) {
-        let _ = writeln!(text, "- {lost}.");
+    let sentences = [texts::answered(rows), texts_without_grid(rows)];
+    for sentence in sentences.into_iter().flatten() {
+        let _ = writeln!(text, "- {sentence}");
     }
     let poor: Vec<String> = stability::scenes(rows)
         .iter()
@@ -37,39 +35,65 @@ pub fn failures(rows: &Rows) -> String {
             poor.join(", ")
         );
     }
-    let scenes = labelled(rows);
-    let losses: Vec<(String, f64, &str)> = stability::disturbances(rows)
-        .into_iter()
-        .filter_map(|(name, changes)| {
-            let measured = scenes.iter().zip(changes);
-            let measured = measured.filter_map(|(scene, change)| Some((*scene, change?.mean)));
-            let (scene, loss) = measured.min_by(|a, b| a.1.total_cmp(&b.1))?;
-            Some((name, loss, scene))
-        })
-        .collect();
-    let listed = |keep: &dyn Fn(f64) -> bool| {
-        let kept = losses.iter().filter(|(_, loss, _)| keep(*loss));
-        let named =
-            kept.map(|(name, loss, scene)| format!("{name} ({} on {scene})", signed(*loss, 1)));
-        named.collect::<Vec<_>>().join(", ")
-    };
-    for (about, names) in [
-        (
-            format!("Disturbances that cost more than {MANY_POINTS:.0} points on some scene"),
-            listed(&|loss| loss < -MANY_POINTS),
-        ),
-        (
-            format!(
-                "Disturbances that cost less than {FEW_POINTS:.0} points on every scene [that was measured](stability.md)"
-            ),
-            listed(&|loss| loss > -FEW_POINTS),
-        ),
-    ] {
-        if !names.is_empty() {
-            let _ = writeln!(text, "- {about}, with the largest loss: {names}.");
+    let losses = losses(rows);
+    let mut list = |about: &str, is_listed: &dyn Fn(&Loss) -> bool| {
+        let listed: Vec<&Loss> = losses.iter().filter(|loss| is_listed(loss)).collect();
+        if !listed.is_empty() {
+            let _ = writeln!(text, "- {about}:");
         }
-    }
+        for loss in listed {
+            let _ = writeln!(
+                text,
+                "  - {}: {} on {} (measured on {})",
+                loss.name,
+                signed(loss.points, 1),
+                loss.scene,
+                loss.measured.join(", ")
+            );
+        }
+    };
+    list(
+        &format!("Disturbances that cost more than {MANY_POINTS:.0} points on some scene"),
+        &|loss| loss.points < -MANY_POINTS,
+    );
+    list(
+        &format!(
+            "Disturbances that cost less than {FEW_POINTS:.0} points on every [measured scene](stability.md), with \
+             the largest loss"
+        ),
+        &|loss| loss.points > -FEW_POINTS,
+    );
     text
+}
+
+/// The largest loss by a disturbance.
+struct Loss<'a> {
+    name: String,
+    points: f64,
+    scene: &'a str,
+    measured: Vec<&'a str>,
+}
+
+fn losses(rows: &Rows) -> Vec<Loss<'_>> {
+    let scenes = labelled(rows);
+    let loss = |(name, changes): (String, Vec<Option<Mean>>)| {
+        let measured = scenes.iter().zip(changes);
+        let measured: Vec<(&str, f64)> = measured
+            .filter_map(|(scene, change)| Some((*scene, change?.mean)))
+            .collect();
+        let (scene, points) = *measured.iter().min_by(|a, b| a.1.total_cmp(&b.1))?;
+        Some(Loss {
+            name,
+            points,
+            scene,
+            measured: measured.iter().map(|(scene, _)| *scene).collect(),
+        })
+    };
+    let disturbances = stability::disturbances(rows).into_iter();
+    disturbances
+        .filter(|(name, _)| !name.starts_with(UNCHANGED))
+        .filter_map(loss)
+        .collect()
 }
 
 /// States on which scenes texts are answered better by mean embeddings of Gaussians than by the
@@ -83,8 +107,8 @@ pub fn texts_without_grid(rows: &Rows) -> Option<String> {
     let worse: Vec<String> = worse.collect();
     (!worse.is_empty()).then(|| {
         format!(
-            "With the built-in encoder and without its detector, mean embeddings of Gaussians answer texts better \
-             than the grid (mean IoU: {}). They never refuse a text",
+            "Without the detector, the built-in encoder answers texts better with mean embeddings of Gaussians than \
+             with the grid. Mean IoU: {}. Mean embeddings refuse no text.",
             worse.join(", ")
         )
     })
@@ -101,6 +125,7 @@ pub fn changes(rows: &Rows) -> String {
     let head = [
         "way",
         "scenes",
+        "seeds",
         "time",
         "size",
         "PSNR, dB",
@@ -148,6 +173,7 @@ fn line(rows: &Rows, way: &Way) -> Option<Vec<String>> {
     Some(vec![
         way.name.to_owned(),
         scenes.join(", "),
+        figures::seeds(pairs.iter().map(|(_, runs, _)| runs)),
         times(over_scenes(&|runs, reference| runs.time_ratio(reference))),
         times(over_scenes(&|runs, reference| runs.ratio(bytes, reference))),
         psnr,
@@ -168,7 +194,7 @@ mod tests {
         let standard = text.lines().find(|line| line.contains("standard"));
         assert_eq!(
             standard,
-            Some("| standard | fox | x 3.31 | x 1.00 | 0.00 | -10.0 | -5.0 |"),
+            Some("| standard | fox | 1 | x 3.31 | x 1.00 | 0.00 | -10.0 | -5.0 |"),
             "{text}"
         );
     }
@@ -192,12 +218,12 @@ mod tests {
         let text = failures(&rows());
         assert!(
             text.contains(
-                "more than 10 points on some scene, with the largest loss: blur 2 px (-30.0 on fox)"
+                "more than 10 points on some scene:\n  - blur 2 px: -30.0 on fox (measured on fox)\n"
             ),
             "{text}"
         );
         assert!(
-            text.contains("twins 0.30") && text.contains("JPEG quality 15 (-1.0 on fox)"),
+            text.contains("twins 0.30") && text.contains("JPEG quality 15: -1.0 on fox"),
             "{text}"
         );
     }

@@ -25,8 +25,8 @@ pub fn answered(rows: &Rows) -> Option<String> {
         .filter_map(|(_, runs)| runs.mean("oracle_miou"));
     let best = Mean::of(best.map(|mean| mean.mean))?;
     Some(format!(
-        "the built-in encoder answers {:.0} of {:.0} labels correctly ({}), although the best object has a mean IoU \
-         of {:.2} to {:.2} with them",
+        "The built-in encoder answers {:.0} of {:.0} labels correctly ({}). The best objects have a mean IoU of {:.2} \
+         to {:.2} with them.",
         of("right"),
         of("labels"),
         names.join(", "),
@@ -52,8 +52,8 @@ pub fn with_clip(rows: &Rows) -> Option<String> {
         Some(format!("{:.0} %", 100.0 * share))
     };
     Some(format!(
-        "With CLIP embeddings of the objects in {} scanned rooms, {} of the names of walls, floors and doors get an answer, {} \
-         of furniture names, and {} of absent names. Whether these answers are right was not measured",
+        "With OpenCLIP embeddings of the objects in {} scanned rooms, {} of the names of walls, floors and doors get an \
+         answer, {} of furniture names, and {} of absent names. Whether these answers are right was not measured.",
         clip["rooms"].as_array()?.len(),
         share("present")?,
         share("furniture")?,
@@ -110,7 +110,8 @@ fn by_way(rows: &Rows) -> Vec<Vec<String>> {
 pub fn page(rows: &Rows) -> String {
     let mut text = format!(
         "# Answers to texts\n\n{}\nThe built-in encoder has 80 everyday classes, 1,000 other classes and a sentence encoder. *Labels*: \
-         names of objects in held-out views, once for each view. *Right*: labels whose answer has an IoU of a half \
+         names of objects in held-out views, once for each view; [evaluation](../research/evaluation.md#scenes) has the \
+         numbers of distinct names, and of labels that join several objects. *Right*: labels whose answer has an IoU of a half \
          at least. *Text*: IoU of the answer, mean over the labels; no answer is 0. *Best object*: IoU of the best \
          single object. Some labels join several objects, which no single object covers. *Refused*: of 40 names of things that are not in the \
          scene, with which the encoder was calibrated too. Means over the seeds, with their range in brackets.\n\n## Scenes, worst first\n\n{}",
@@ -139,7 +140,7 @@ pub fn page(rows: &Rows) -> String {
     if let Some(found) = with_clip(rows) {
         let _ = write!(
             text,
-            "\n## CLIP\n\n{found}. Embeddings are of OpenCLIP ViT-B/16 and SAM's masks in ScanNet. The thresholds for each room are \
+            "\n## CLIP\n\n{found} Embeddings are of OpenCLIP ViT-B/16 and SAM's masks in ScanNet. The thresholds for each room are \
              from the other rooms. `fastlgs-bench clip FOLDER` measures this ([details](../research/clip.md)).\n"
         );
     }

@@ -6,7 +6,7 @@ mod panels;
 
 pub use heat_map::{Cell, HeatMap};
 pub use lines::{Line, Lines};
-pub use panels::{Panel, Panels, Point};
+pub use panels::{Marker, Panel, Panels, Point};
 
 use anyhow::{Context, Result, anyhow};
 use fastlgs_core::image_io;
@@ -172,7 +172,8 @@ mod tests {
             name: "spot".to_owned(),
             x,
             y,
-            range: (y, y),
+            ranges: [(x, x), (y, y)],
+            marker: Marker::Triangle,
             front: true,
         };
         let axes = Axes {

@@ -11,10 +11,18 @@ pub struct Point {
     pub name: String,
     pub x: f64,
     pub y: f64,
-    /// Lowest and highest y, drawn as a bar.
-    pub range: (f64, f64),
+    /// Lowest and highest x and y, drawn as bars.
+    pub ranges: [(f64, f64); 2],
+    pub marker: Marker,
     /// Whether the point is on the Pareto front. Such points are filled and joined by a line.
     pub front: bool,
+}
+
+/// Shape of a point.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Marker {
+    Circle,
+    Triangle,
 }
 
 /// One of several scatter charts with the same axes.
@@ -80,11 +88,11 @@ impl Name {
     }
 }
 
-/// Returns round numbers of a range for a logarithmic axis; powers of ten if it is wide.
+/// Returns round numbers of a range for a logarithmic axis, fewer if it is wide.
 fn ticks(left: f64, right: f64) -> Vec<f64> {
     let decades = left.log10().floor() as i32..=right.log10().floor() as i32;
     let digits: &[f64] = if right > 100.0 * left {
-        &[1.0]
+        &[1.0, 3.0]
     } else {
         &[1.0, 1.5, 2.0, 3.0, 5.0, 7.0]
     };
@@ -116,8 +124,8 @@ impl Panels<'_> {
         DB::ErrorType: 'static,
     {
         let points = || panel.points.iter().filter(|p| p.x > 0.0 && p.y.is_finite());
-        let (left, right) = span(points().map(|p| p.x));
-        let (low, high) = span(points().flat_map(|p| [p.range.0, p.range.1]));
+        let (left, right) = span(points().flat_map(|p| [p.ranges[0].0, p.ranges[0].1]));
+        let (low, high) = span(points().flat_map(|p| [p.ranges[1].0, p.ranges[1].1]));
         // Differences that seeds make alone do not fill the chart.
         let margin = 0.1 * (high - low) + 0.5 * (MIN_SPAN - (high - low)).max(0.0);
         let beside = 1.1 * (right / left).powf(0.1);
@@ -143,20 +151,25 @@ impl Panels<'_> {
         let mut front: Vec<(f64, f64)> = points().filter(|p| p.front).map(|p| (p.x, p.y)).collect();
         front.sort_by(|a, b| a.0.total_cmp(&b.0));
         chart.draw_series(LineSeries::new(front.clone(), COLOR.stroke_width(1)))?;
-        chart.draw_series(points().map(|p| {
-            let ends = vec![(p.x, p.range.0), (p.x, p.range.1)];
-            PathElement::new(ends, BLACK.mix(0.4).stroke_width(1))
+        chart.draw_series(points().flat_map(|p| {
+            let [x, y] = p.ranges;
+            let bars = [[(p.x, y.0), (p.x, y.1)], [(x.0, p.y), (x.1, p.y)]];
+            bars.map(|ends| PathElement::new(ends.to_vec(), BLACK.mix(0.4).stroke_width(1)))
         }))?;
         let mut sorted: Vec<&Point> = points().collect();
         sorted.sort_by(|a, b| b.y.total_cmp(&a.y).then(a.x.total_cmp(&b.x)));
         chart.draw_series(sorted.iter().map(|p| {
-            let fill = if p.front {
-                COLOR.filled()
-            } else {
-                COLOR.stroke_width(1)
-            };
-            Circle::new((p.x, p.y), 4, fill)
+            let at = (p.x, p.y);
+            match p.marker {
+                Marker::Circle if p.front => Circle::new(at, 4, COLOR.filled()).into_dyn(),
+                Marker::Circle => Circle::new(at, 4, COLOR).into_dyn(),
+                Marker::Triangle => TriangleMarker::new(at, 6, COLOR.filled()).into_dyn(),
+            }
         }))?;
+        // Triangles are always filled.
+        let is_hollow = |p: &&&Point| p.marker == Marker::Triangle && !p.front;
+        let hollow = sorted.iter().filter(is_hollow);
+        chart.draw_series(hollow.map(|p| TriangleMarker::new((p.x, p.y), 4, WHITE.filled())))?;
         let (columns, lines) = area.get_pixel_range();
         let pixel = |x: f64, y: f64| {
             let (x, y) = chart.backend_coord(&(x, y));
@@ -248,7 +261,7 @@ mod tests {
     fn ticks_are_round_numbers_in_the_range() {
         assert_eq!(ticks(60.0, 210.0), [70.0, 100.0, 150.0, 200.0]);
         assert_eq!(ticks(4.0, 12.0), [5.0, 7.0, 10.0]);
-        assert_eq!(ticks(4.0, 1200.0), [10.0, 100.0, 1000.0]);
+        assert_eq!(ticks(4.0, 1200.0), [10.0, 30.0, 100.0, 300.0, 1000.0]);
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! All ways, with what each of them does.
 
-use super::{BASE, How, MEAN_EMBEDDINGS, On, Page, UNCHANGED, UNDETECTED, UNLIMITED, Way};
+use super::{
+    BASE, How, MEAN_EMBEDDINGS, On, PAPER_MAPPING, Page, UNCHANGED, UNDETECTED, UNLIMITED, Way,
+};
 use crate::disturb::{MaskChange, PhotoChange};
 
 const fn way(
@@ -43,15 +45,15 @@ pub const WAYS: &[Way] = {
             Make(&[]),
         ),
         way(
-            &[Paper],
+            &[Paper, Speed],
             UNDETECTED,
-            "objects are named by their embeddings alone; all other ways of the paper lack the detector too, but *code of 3 numbers*",
+            "objects are named by their embeddings alone, without the votes of the detector of everyday classes; the times are those of *quick*",
             Given,
             WithoutDetector,
         ),
         way(
             &[Paper, Speed],
-            "paper's mapping",
+            PAPER_MAPPING,
             "`train --mapping paper`: Algorithm 1 finds the objects by embeddings, key points and colours",
             Given,
             Remap(&["--mapping", "paper"]),
@@ -129,7 +131,7 @@ pub const WAYS: &[Way] = {
         way(
             &[Stability],
             UNCHANGED,
-            "*quick* from the prepared photos; the reference of all changed photos",
+            "*quick* from the prepared photos; all changed photos are compared with it",
             Photographed(3),
             Photos(PhotoChange::Unchanged),
         ),
@@ -290,49 +292,49 @@ pub const WAYS: &[Way] = {
         way(
             &[Size],
             "code of 1 number",
-            "a code of 1 number instead",
+            "a code of 1 number instead of 3",
             Given,
             Baseline("code1"),
         ),
         way(
             &[Size],
             "code of 2 numbers",
-            "a code of 2 numbers instead",
+            "a code of 2 numbers instead of 3",
             Given,
             Baseline("code2"),
         ),
         way(
             &[Size],
             "code of 4 numbers",
-            "a code of 4 numbers instead",
+            "a code of 4 numbers instead of 3",
             Given,
             Baseline("code4"),
         ),
         way(
             &[Size],
             "code with an axis for each object",
-            "such codes do not mix; what they lose are the larger objects at each pixel",
+            "as many numbers as objects: such codes do not mix; only the larger objects at each pixel are lost",
             Given,
             Baseline("codes"),
         ),
         way(
             &[Paper],
             "paper: theta 0.98",
-            "Algorithm 1 with another least similarity of embeddings, instead of 0.7",
+            "Algorithm 1 with a minimum similarity of embeddings of 0.98 instead of 0.7",
             Given,
             Remap(&["--mapping", "paper", "--theta", "0.98"]),
         ),
         way(
             &[Paper],
             "paper: tau 30",
-            "Algorithm 1 with another least number of key points, instead of 4",
+            "Algorithm 1 with a minimum of 30 matched key points instead of 4",
             Given,
             Remap(&["--mapping", "paper", "--tau", "30"]),
         ),
         way(
             &[Paper],
             "paper: alpha 0.05",
-            "Algorithm 1 with another weight of colours, instead of 0.3",
+            "Algorithm 1 with a weight of colours of 0.05 instead of 0.3",
             Given,
             Remap(&["--mapping", "paper", "--alpha", "0.05"]),
         ),

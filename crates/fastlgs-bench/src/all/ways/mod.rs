@@ -73,25 +73,36 @@ impl Way {
     pub fn reference(&self) -> &'static str {
         match self.how {
             How::Photos(change) if change != PhotoChange::Unchanged => UNCHANGED,
+            How::Remap(_) if self.name != PAPER_MAPPING => PAPER_MAPPING,
             _ => BASE,
         }
     }
 
     /// Name of the way whose answers to texts this one is compared with. The detector of everyday
     /// classes is part of neither the paper nor other fields, so ways without it are compared with
-    /// its absence.
+    /// one that lacks it too.
     pub fn text_reference(&self) -> &'static str {
-        let has_detector = match self.how {
-            How::Remap(_) => false,
-            How::Baseline(method) => method.starts_with("code"),
-            How::Train(options) => !options.contains(&"like-paper"),
-            _ => true,
-        };
-        if has_detector {
+        let is_reference = self.name == UNDETECTED || self.reference() != BASE;
+        if self.has_detector() || is_reference {
             self.reference()
         } else {
             UNDETECTED
         }
+    }
+
+    /// Whether objects have votes of the detector of everyday classes.
+    pub fn has_detector(&self) -> bool {
+        match self.how {
+            How::Remap(_) | How::WithoutDetector => false,
+            How::Baseline(method) => method.starts_with("code"),
+            How::Train(options) => !options.contains(&"like-paper"),
+            _ => true,
+        }
+    }
+
+    /// Whether it starts from prepared photos, so that its seconds lack any repair of poses.
+    pub fn starts_prepared(&self) -> bool {
+        matches!(self.how, How::Photos(_))
     }
 
     /// Whether its photos have another size, so that their PSNR is that of other pixels.
@@ -112,6 +123,9 @@ pub const UNCHANGED: &str = "photos as they are";
 
 /// The default way without the detector of everyday classes.
 pub const UNDETECTED: &str = "quick without the detector";
+
+/// Objects by Algorithm 1 of the paper.
+pub const PAPER_MAPPING: &str = "paper's mapping";
 
 /// The field without objects that the paper compares its grid with.
 pub const MEAN_EMBEDDINGS: &str = "mean embeddings without a grid";
