@@ -360,7 +360,8 @@ fn paper(rows: &Rows) -> String {
          Generated scenes have exact masks, photos those of the built-in segmenter. The paper has SAM's masks and CLIP's \
          embeddings. With the built-in encoder, masks of one object are less similar, so theta is 0.7 instead of the paper's \
          0.95. Only *quick* and *code of 3 numbers* have the detector of everyday classes. All but *quick* and *preset like-paper* keep \
-         the Gaussians of *quick*. *Preset like-paper* refuses no text.\n\n## Best object\n\n{}\n## Answer to a text\n\n{}{PAPER_FIGURES}{}",
+         the Gaussians of *quick*. *Preset like-paper* refuses no text. The threshold tau_ac of rendered codes was \
+         measured with [an earlier version](../research/paper.md).\n\n## Best object\n\n{}\n## Answer to a text\n\n{}{PAPER_FIGURES}{}",
         stamp(rows),
         table_of("oracle_miou"),
         table_of("miou"),
