@@ -85,13 +85,20 @@ impl<'a> Runs<'a> {
         Mean::of(self.rows.iter().filter_map(|row| row[figure].as_f64()))
     }
 
-    /// Seconds from photos to answers, or of one stage.
-    pub fn seconds(&self, stage: Option<&str>) -> Option<Mean> {
-        let of = |row: &&Value| match stage {
-            Some(stage) => row["seconds"][stage].as_f64(),
-            None => total_seconds(row),
-        };
+    /// Seconds of a stage.
+    pub fn seconds(&self, stage: &str) -> Option<Mean> {
+        let of = |row: &&Value| row["seconds"][stage].as_f64();
         Mean::of(self.timed.iter().filter_map(of))
+    }
+
+    /// Seconds from photos to answers.
+    pub fn total_seconds(&self) -> Option<Mean> {
+        Mean::of(self.timed.iter().filter_map(|row| total_seconds(row)))
+    }
+
+    /// Size of all files that a query needs.
+    pub fn megabytes(&self) -> Option<Mean> {
+        Some(self.mean("scene_bytes")?.times(1e-6))
     }
 
     /// Milliseconds of the first query of a view.
@@ -226,7 +233,7 @@ mod tests {
         rows.rows[0]["machine"] = json!("another");
         let quick = Runs::of(&rows, "fox", BASE).expect("two rows");
         assert_eq!(quick.rows.len(), 2);
-        assert_eq!(quick.seconds(None), Mean::of([15.0]));
+        assert_eq!(quick.total_seconds(), Mean::of([15.0]));
         rows.rows[0]["query_ms"] = json!(30.0);
         let quick = Runs::of(&rows, "fox", BASE).expect("two rows");
         assert_eq!(quick.query_milliseconds(), Mean::of([20.0]));

@@ -3,6 +3,7 @@
 //! Measured rows are kept in `rows.json`, so that an interrupted run continues with the next row.
 //! All pages are made from these rows alone.
 
+mod charts;
 mod figures;
 mod index;
 mod markdown;

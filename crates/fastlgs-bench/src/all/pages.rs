@@ -1,12 +1,12 @@
-//! Tables and charts of `fastlgs-bench all`, made from its rows alone.
+//! The pages of `fastlgs-bench all`, made from its rows alone.
 
 use super::figures::{self, Mean, Runs, given, labelled};
 use super::markdown::{MEANS, TEXT, stamp, table};
 use super::rows::Rows;
 use super::stability;
-use super::ways::{BASE, Page, UNDETECTED, UNLIMITED, Way, on};
-use super::{index, summary, texts};
-use crate::plot::{self, Axes, Marker, Panel, Panels, Point};
+use super::ways::{BASE, Page, UNDETECTED, UNLIMITED, on};
+use super::{charts, index, summary, texts};
+use crate::plot::Panel;
 use anyhow::Result;
 
 /// Returns name and text of all files.
@@ -19,143 +19,9 @@ pub fn all(rows: &Rows) -> Result<Vec<(String, String)>> {
         ("size.md".to_owned(), size(rows)),
         ("paper.md".to_owned(), paper(rows)),
     ];
-    let charts = [
-        (
-            "speed.svg",
-            panels(rows, Page::Speed, total, best, circle),
-            "Accuracy against time: from posed photos to answers",
-            "seconds",
-            "best object, mean IoU",
-        ),
-        (
-            "speed-texts.svg",
-            panels(rows, Page::Speed, total, answer, by_detector),
-            "Answers to texts against time: from posed photos to answers (triangles: without the detector of everyday classes)",
-            "seconds",
-            "answer, mean IoU",
-        ),
-        (
-            "query.svg",
-            panels(
-                rows,
-                Page::Speed,
-                |runs| runs.query_milliseconds(),
-                answer,
-                by_detector,
-            ),
-            "Answers to texts against time: first answer in a view; fields without objects: its rendering (triangles: no detector)",
-            "milliseconds",
-            "answer, mean IoU",
-        ),
-        (
-            "size.svg",
-            panels(rows, Page::Size, megabytes, best, circle),
-            "Accuracy against size",
-            "megabytes",
-            "best object, mean IoU",
-        ),
-        (
-            "size-psnr.svg",
-            panels(
-                rows,
-                Page::Size,
-                megabytes,
-                |runs| runs.mean("psnr"),
-                circle,
-            ),
-            "Colour against size",
-            "megabytes",
-            "PSNR of held-out views, dB",
-        ),
-    ];
-    for (name, panels, title, x, y) in charts {
-        let axes = Axes { title, x, y };
-        files.push((
-            name.to_owned(),
-            plot::svg(&Panels { axes, panels }, stamp(rows).trim_end())?,
-        ));
-    }
+    files.extend(charts::all(rows)?);
     files.push(("stability.svg".to_owned(), stability::chart(rows)?));
     Ok(files)
-}
-
-fn best(runs: &Runs) -> Option<Mean> {
-    runs.mean("oracle_miou")
-}
-
-fn answer(runs: &Runs) -> Option<Mean> {
-    runs.mean("miou")
-}
-
-fn total(runs: &Runs) -> Option<Mean> {
-    runs.seconds(None)
-}
-
-fn megabytes(runs: &Runs) -> Option<Mean> {
-    Some(runs.mean("scene_bytes")?.times(1e-6))
-}
-
-/// The marker of charts of best objects, which are the same without the detector.
-fn circle(way: &Way) -> Option<Marker> {
-    (way.name != UNDETECTED).then_some(Marker::Circle)
-}
-
-/// The marker of charts of answers to texts.
-fn by_detector(way: &Way) -> Option<Marker> {
-    Some(if way.has_detector() {
-        Marker::Circle
-    } else {
-        Marker::Triangle
-    })
-}
-
-/// Returns a panel for each given scene: the ways of a page, with their Pareto front. Ways that start
-/// from prepared photos are not on it, because their seconds lack any repair of poses.
-fn panels(
-    rows: &Rows,
-    page: Page,
-    x: impl Fn(&Runs) -> Option<Mean>,
-    y: impl Fn(&Runs) -> Option<Mean>,
-    marker: impl Fn(&Way) -> Option<Marker>,
-) -> Vec<Panel> {
-    let point = |scene: &str, way: &Way| {
-        let runs = Runs::of(rows, scene, way.name)?;
-        let (x, y) = (x(&runs)?, y(&runs)?);
-        Some(Point {
-            name: way.name.to_owned(),
-            x: x.mean,
-            y: y.mean,
-            ranges: [(x.low, x.high), (y.low, y.high)],
-            marker: marker(way)?,
-            front: false,
-        })
-    };
-    let panel = |scene: &str| {
-        let of = |prepared: bool| -> Vec<Point> {
-            let ways = on(page).filter(|way| way.starts_prepared() == prepared);
-            ways.filter_map(|way| point(scene, way)).collect()
-        };
-        let mut points = of(false);
-        mark_front(&mut points);
-        points.extend(of(true));
-        Panel {
-            name: scene.to_owned(),
-            points,
-        }
-    };
-    let panels = given(rows).into_iter().map(panel);
-    panels.filter(|panel| panel.points.len() > 1).collect()
-}
-
-/// Marks the Pareto-optimal points: no other point has at most its x and at least its y.
-fn mark_front(points: &mut [Point]) {
-    let all: Vec<(f64, f64)> = points.iter().map(|p| (p.x, p.y)).collect();
-    for point in points {
-        let dominates = |other: &(f64, f64)| {
-            other.0 <= point.x && other.1 >= point.y && *other != (point.x, point.y)
-        };
-        point.front = !all.iter().any(dominates);
-    }
 }
 
 /// Returns the lines of a scene in the table of speed, fastest first.
@@ -172,13 +38,13 @@ fn speed_lines(rows: &Rows, scene: &str, fronts: [&[Panel]; 2]) -> Vec<Vec<Strin
     let mut timed: Vec<(Mean, &str, Runs)> = on(Page::Speed)
         .filter_map(|way| {
             let runs = Runs::of(rows, scene, way.name)?;
-            Some((total(&runs)?, way.name, runs))
+            Some((runs.total_seconds()?, way.name, runs))
         })
         .collect();
     timed.sort_by(|a, b| a.0.mean.total_cmp(&b.0.mean));
     let line = |(seconds, name, runs): &(Mean, &str, Runs)| {
         let stage = |stage: &str| {
-            runs.seconds(Some(stage))
+            runs.seconds(stage)
                 .map_or(String::new(), |s| format!("{:.0}", s.mean))
         };
         let mark = |panels: &[Panel]| if is_on(panels, name) { " *" } else { "" };
@@ -201,8 +67,8 @@ fn speed_lines(rows: &Rows, scene: &str, fronts: [&[Panel]; 2]) -> Vec<Vec<Strin
 }
 
 fn speed(rows: &Rows) -> String {
-    let of_best = panels(rows, Page::Speed, total, best, circle);
-    let of_answers = panels(rows, Page::Speed, total, answer, by_detector);
+    let of_best = charts::objects_by_time(rows);
+    let of_answers = charts::answers_by_time(rows);
     let scenes = labelled(rows).into_iter();
     let lines: Vec<Vec<String>> = scenes
         .flat_map(|scene| speed_lines(rows, scene, [&of_best, &of_answers]))
@@ -254,7 +120,7 @@ fn size(rows: &Rows) -> String {
                     name.to_owned(),
                     runs.rows.len().to_string(),
                     runs.text("gaussians", 0),
-                    megabytes(&runs).map_or(String::new(), |m| m.text(1)),
+                    runs.megabytes().map_or(String::new(), |m| m.text(1)),
                     runs.text("psnr", 2),
                     runs.text("oracle_miou", 3),
                 ]);
@@ -416,25 +282,5 @@ mod tests {
             place("| twins | 1 | 0.30 |") < place("| fox | 2 | 0.85"),
             "worst first"
         );
-    }
-
-    #[test]
-    fn the_front_has_all_points_that_no_point_dominates() {
-        let point = |x: f64, y: f64| Point {
-            name: String::new(),
-            x,
-            y,
-            ranges: [(x, x), (y, y)],
-            marker: Marker::Circle,
-            front: false,
-        };
-        let mut points = [
-            point(1.0, 0.5),
-            point(2.0, 0.4),
-            point(3.0, 0.6),
-            point(1.0, 0.5),
-        ];
-        mark_front(&mut points);
-        assert_eq!(points.map(|p| p.front), [true, false, true, true]);
     }
 }

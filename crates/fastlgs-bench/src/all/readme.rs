@@ -89,7 +89,7 @@ fn readme_table(rows: &Rows) -> String {
             )
         }),
         line("seconds from posed photos to answers", &|runs| {
-            runs.seconds(None).map_or(String::new(), |s| s.text(0))
+            runs.total_seconds().map_or(String::new(), |s| s.text(0))
         }),
     ];
     let titles: Vec<String> = scenes

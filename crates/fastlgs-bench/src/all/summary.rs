@@ -185,6 +185,7 @@ fn line(rows: &Rows, way: &Way) -> Option<Vec<String>> {
 #[cfg(test)]
 mod tests {
     use super::super::rows::tests::{row, rows};
+    use super::super::ways::PAPER_MAPPING;
     use super::*;
 
     #[test]
@@ -211,6 +212,18 @@ mod tests {
         );
         let text = failures(&rows);
         assert!(text.contains("fox 0.30 instead of 0.20"), "{text}");
+    }
+
+    #[test]
+    fn changes_of_the_papers_mapping_are_compared_with_it() {
+        let mut rows = rows();
+        rows.rows.push(row("fox", PAPER_MAPPING, 0, 0.5, 10.0));
+        rows.rows.push(row("fox", "paper: tau 30", 0, 0.6, 10.0));
+        let text = changes(&rows);
+        assert!(
+            text.contains("| paper: tau 30 | fox | 1 | x 1.00 | x 1.00 | 0.00 | +10.0 | +5.0 |"),
+            "{text}"
+        );
     }
 
     #[test]
