@@ -111,9 +111,9 @@ pub fn page(rows: &Rows) -> String {
     let mut text = format!(
         "# Answers to texts\n\n{}\nThe built-in encoder has 80 everyday classes, 1,000 other classes and a sentence encoder. *Labels*: \
          names of objects in held-out views, once for each view; [evaluation](../research/evaluation.md#scenes) has the \
-         numbers of distinct names, and of labels that join several objects. *Right*: labels whose answer has an IoU of a half \
+         numbers of distinct names. *Right*: labels whose answer has an IoU of a half \
          at least. *Text*: IoU of the answer, mean over the labels; no answer is 0. *Best object*: IoU of the best \
-         single object. Some labels join several objects, which no single object covers. *Refused*: of 40 names of things that are not in the \
+         single object. [Some labels](../research/evaluation.md#scenes) join several objects, which no single object covers. *Refused*: of 40 names of things that are not in the \
          scene, with which the encoder was calibrated too. Means over the seeds, with their range in brackets.\n\n## Scenes, worst first\n\n{}",
         stamp(rows),
         table(

@@ -82,11 +82,9 @@ impl Way {
     /// classes is part of neither the paper nor other fields, so ways without it are compared with
     /// one that lacks it too.
     pub fn text_reference(&self) -> &'static str {
-        let is_reference = self.name == UNDETECTED || self.reference() != BASE;
-        if self.has_detector() || is_reference {
-            self.reference()
-        } else {
-            UNDETECTED
+        match self.reference() {
+            BASE if !self.has_detector() && self.name != UNDETECTED => UNDETECTED,
+            reference => reference,
         }
     }
 
